@@ -2,7 +2,6 @@
 """A known delay of y: the inputs that acted then, the estimate's time, and the present."""
 
 from fhaosmo_ros.core import ConfigurationError, Family, Observer, OnlineEstimator
-from fhaosmo_ros.core.online.policy import PIECES
 from fhaosmo_ros.core.simulation.plant import respond
 from fhaosmo_ros.tools.tuning.objective import Objective, TUNE_PARAMETERS
 from hypothesis import given
@@ -124,10 +123,10 @@ def test_inputs_of_an_interval_are_their_mean_and_what_is_withdrawn_has_not_been
 
 
 def test_more_pieces_than_there_is_room_for_lose_the_oldest():
-    count = PIECES + 100
+    count = 512 + 100
     pieces = [(10, k, -k) for k in range(count)]
     now = np.zeros(2)
-    for back in (1, 100, PIECES - 2):
+    for back in (1, 100, 510):
         newest = count - 1 - back
         found = acting(pieces, 10 * (back + 1), 10, now)
         np.testing.assert_array_equal(found, [newest, -newest])

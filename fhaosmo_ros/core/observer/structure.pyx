@@ -501,7 +501,7 @@ cdef class Estimate:
 
     @property
     def open_levels(self):
-        """Number of levels that run: i is open if |eps_j| <= epsilon for every j < i."""
+        """Number of levels that run (the paper's E_i)."""
         return self.word >> LEVEL_SHIFT
 
     def __reduce__(self):

@@ -27,15 +27,13 @@ import numpy as np
 cdef double GAP_RATIO = 2.0
 # Bounds what one sample may cost: a few milliseconds.
 cdef int MOST_STEPS = 10_000
-MOST_SUB_STEPS = MOST_STEPS
 # With max_gap = 0 an interval of more usual ones is a gap; one of more nanoseconds while there
 # is none to compare it with.
 cdef double MOST_INTERVALS = 500.0, FIRST_GAP = 3.6e12
 GAP_SAMPLES = MOST_INTERVALS
 cdef double NANOSECONDS = 1e-9
+# Room for so many different values of the inputs within the delay; older ones are forgotten.
 cdef int MOST_PIECES = 512
-PIECES = MOST_PIECES
-"""Room for so many different values of the inputs within the delay; older ones are forgotten."""
 # A step of y is a multiple of another one up to this, and up to rounding of y to 32 bits.
 cdef double MULTIPLE = 1e-4, SINGLE = 6e-7
 # After so many regular changes y's sensor holds its values; so many are remembered.
