@@ -137,7 +137,7 @@ cdef class Bank:
         torque_variance : (n,) array
             Of u, from sample to sample.
         shape : (n, n) array
-            Sum of J^T J over the links: how forces on the arm act on its joints.
+            Sum of J^T J over the links, by their shares: how forces act on the joints.
 
         """
         cdef int i, k, n = self.joints
