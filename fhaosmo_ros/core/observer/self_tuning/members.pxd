@@ -111,7 +111,7 @@ cdef struct Shared:
     double goes_back  # of late, the share of the steps of y that go back at once
     double far_sign  # sign of the last innovation that was too far off for every member
     double growing  # unlikely samples in a row that are farther and farther off (D 33)
-    double size_of_d  # mean square of the estimates of d of late
+    double size_of_d  # mean square of d of late, by its estimates and their variances
     double first_off  # how far off the first of the unlikely samples in a row was
     double uneven  # mean square of the highest difference of y in these samples
     double first_rough  # what `roughness` was before the first of them

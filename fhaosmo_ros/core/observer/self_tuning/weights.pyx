@@ -111,7 +111,8 @@ cdef VECTORISED mix(Members* m, double slider, double* mean, double* variances) 
     Write the mean of the members' estimates of z, d, d', .., and its variances (D 28).
 
     Members do not know how large d usually is: where their estimates of it are vague, they are
-    drawn to 0, as for a d whose standard deviation is `HUBER` times its size of late.
+    drawn to 0, as for a d whose standard deviation is `HUBER` times its size of late. That is of
+    the estimates and of what they miss, which counts as far as it is smaller than the size so far.
     The first one is NaN if a member, or its weight, is lost: where Phi or P grows without a limit.
     """
     cdef Work* w = &m.work
@@ -146,7 +147,7 @@ cdef VECTORISED mix(Members* m, double slider, double* mean, double* variances) 
                 total += weight[g] * off if weight[g] > 0.0 else 0.0
         variances[i] = total
     total = m.shared.size_of_d + (
-        mean[n] * mean[n] - m.shared.size_of_d
+        mean[n] * mean[n] + fmin(variances[n], m.shared.size_of_d) - m.shared.size_of_d
     ) / (w.sample.average - FIRST_SAMPLES)
     m.shared.size_of_d = total
     if total > 0.0:
