@@ -340,7 +340,7 @@ class Arm:
             self._refuse(problem)
             if problem == 'jumped':
                 return None
-            samples.take(time, sample, None, velocity)
+            samples.take(time, sample, None, bank.motion)  # as the first one
         if problem:
             self._first = self._drive(q, velocity, torque, velocity)
             self._reach = np.sum(self.model.reach_of_links(q), axis=0)

@@ -199,7 +199,7 @@ cdef class Bank:
                 &self.x[j, 0], &self.p[j, 0, 0], stay * self.w[j] * share, all_x, all_p, share,
                 &self.off[0], size,
             )  # fmt: skip
-            self.begun[j] = begin * self.w[0] / self.mixed[j]
+            self.begun[j] = begin * self.w[0] * share
         for k in range(n):  # of contact that has ended nobody needs d any more
             for a in range(2 * n):
                 self.sum_p[1, a, 2 * n + k] = -self.average[2 * n + k] * contact_x[a]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What samples of an arm say by themselves: their noise, and their time."""
+"""What samples of an arm say by themselves: which can be used, their noise, and their time."""
 
 from libc.math cimport fabs, floor, fmax, fmin, INFINITY, M_PI, sqrt
 
@@ -212,7 +212,7 @@ cdef class Samples:
     """
 
     cdef readonly double h, vague  # time in which the joints moved, and share that is not known
-    cdef readonly object moved, change, speed  # (n,): positions, what is measured, and velocities
+    cdef readonly object change, speed  # (n,): what `Bank.step` takes, and velocities
     cdef readonly Noise noise
     cdef readonly Clock clock
     cdef double[:, ::1] lowest, highest
@@ -232,9 +232,9 @@ cdef class Samples:
         self.lowest, self.highest, self.noisy, self.stopping = lowest, highest, noisy, stopping
         self.turning = np.array(turning, dtype=np.uint8)
         self.rest, self.position = np.zeros(n), np.zeros(n)
-        self.moved, self.speed = np.zeros(n), np.zeros(n)
-        self.change = self.moved if of_position else self.speed
-        self.way, self.rate = self.moved, self.speed
+        self.way, self.rate = np.zeros(n), np.zeros(n)
+        self.speed = np.asarray(self.rate)
+        self.change = np.asarray(self.way) if of_position else self.speed
         self.reset()
 
     def reset(self):
