@@ -158,8 +158,6 @@ def test_two_threads_on_one_estimator_get_an_error(kind):
 
 
 @pytest.mark.parametrize('call', [
-    lambda e: e.policy.advance(10**10, 0.1, np.zeros(0)),
-    lambda e: e.policy.advance(10**10, 0.1, np.zeros(3)),
     lambda e: e.policy.run(STAMPS[:2], Y, np.zeros((len(Y), 1))),
     lambda e: e.policy.run(STAMPS, Y, np.zeros((2, 1))),
     lambda e: e.policy.run(STAMPS, Y, np.zeros((len(Y), 2))),
