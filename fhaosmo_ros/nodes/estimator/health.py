@@ -220,7 +220,7 @@ class Health:
         moved = f'gamma is {away:+.2g} away from gamma_initial'
         report.find(WARN, moved, abs(away) > GAMMA_AWAY)
         tuned = observer.parameters['correction_period']
-        if tuned and mean > 0.0 and observer.parameters['scheme'] == 'predict_correct':
+        if tuned and mean > 0.0 and observer.configuration.levant:
             rates = f'gains are for {1.0 / tuned:.4g} Hz, y comes at {1.0 / mean:.4g} Hz'
             report.find(WARN, rates, not tuned / RATE_RATIO < mean < tuned * RATE_RATIO)
         wide = f'innovations are {spread:.3g} times as large as noise_size says'
