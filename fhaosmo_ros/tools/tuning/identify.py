@@ -32,7 +32,7 @@ from scipy.stats import chi2, median_abs_deviation
 Floats = NDArray[np.float64]
 Recorded = tuple[Floats, Floats, Floats]
 Evaluate = Callable[[Design], Evaluation]
-DERIVATIVES = (0, 1, 2)
+DERIVATIVES = (0, 1, 2, 3)
 FIRST = [Design(1, float(w), 0.5) for w in np.geomspace(2e-4, 2.0, 15)]
 """Where the search begins: at the likeliest of these, with bandwidths in rad a sample."""
 SLOWEST, QUICKEST = 1e-5, 3.0
