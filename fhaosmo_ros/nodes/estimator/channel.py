@@ -4,7 +4,7 @@
 from collections.abc import Mapping
 from functools import partial
 from math import isfinite, isnan
-from time import perf_counter, time_ns
+from time import perf_counter
 from typing import Any
 
 from builtin_interfaces.msg import Time
@@ -138,13 +138,10 @@ class Channel:
         self._waits_since = 0.0
         self._without_sample = 0
 
-    def _on_sample(self, stamp: int, y: float, source: int) -> None:
-        """Take a sample; `source` is when its message was published (all times in ns)."""
+    def _on_sample(self, stamp: int, y: float) -> None:
+        """Take a sample."""
         if not self._active:
             return
-        health = self._health
-        health.delay = max(health.delay, time_ns() - source)
-        health.offset = source - stamp if stamp else 0
         measured = stamp
         if self.values['sampling'] == 'clock':
             stamp = self._clock.now().nanoseconds
@@ -223,7 +220,7 @@ class Channel:
             else:
                 self._logger.warning(text)
 
-    def _on_input(self, index: int, name: str, stamp: int, u: float, _: int) -> None:
+    def _on_input(self, index: int, name: str, stamp: int, u: float) -> None:
         if self.pairing.by_stamp and isfinite(u):
             self.pairing.take_input(index, stamp, u)
             self._take_paired()

@@ -51,15 +51,12 @@ class Health:
     Remembers a few numbers of each sample of a `Channel`, and makes two reports of them.
 
     `samples` has the stamp (ns), the time of the step (s) and d of each sample that was used.
-    `latest` is the time of the last one on `perf_counter`. `delay` is the longest time from the
-    publication of a sample to its callback, and `offset` that from its stamp to its publication
-    (ns).
+    `latest` is the time of the last one on `perf_counter`.
     """
 
     def __init__(self, channel: Any) -> None:
         self._channel = channel
         self.samples: deque[tuple[int, float, float]] = deque(maxlen=LIMIT)
-        self.delay, self.offset = -inf, 0
         self.latest = nan
         self._before = self._counts()
         self._events_before = 0
@@ -82,7 +79,6 @@ class Health:
         self._input(reports[0], periods, mean, news, stale)
         self._observer(reports[1], mean, np.array(durations), np.array(d), news, stale)
         self.samples.clear()
-        self.delay = -inf
         return reports
 
     def _input(
@@ -98,8 +94,8 @@ class Health:
         source, heard = y.source, y.source.heard
         rate = 1.0 / mean if mean > 0.0 else nan
         jitter = float(np.std(periods)) * rate if len(periods) else nan
-        delay = self.delay * NANOSECONDS if self.delay > -inf else nan
-        offset = self.offset * NANOSECONDS
+        delay = source.delay * NANOSECONDS if source.delay > -inf else nan
+        offset = y.offset * NANOSECONDS
         age = perf_counter() - self.latest
         stamps = 'clock' if limits['sampling'] == 'clock' else y.stamps
         report.values = {

@@ -9,6 +9,7 @@ publishes a type that has a wanted field.
 from collections.abc import Callable, Iterable, Mapping
 from copy import copy
 import math
+from time import time_ns
 from typing import Any
 
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
@@ -33,8 +34,8 @@ STAMPS = {'source': 'source_timestamp', 'reception': 'received_timestamp'}
 UNKNOWN = '_NODE_NAME_UNKNOWN_'
 """The name of a node that has been discovered later than its publisher, or is none of ROS."""
 Gid = tuple[int, ...]
-Take = Callable[[int, float, int], None]
-"""Gets the stamp of a sample, its value, and when it was published; times in nanoseconds."""
+Take = Callable[[int, float], None]
+"""Gets the stamp of a sample in nanoseconds, and its value."""
 
 
 class Listener:
@@ -44,7 +45,8 @@ class Listener:
     `is_sample`: of y, not of a known input, which a message gives first. `field`, the `element` of
     a list that is meant by name, and `stamps` (header, source or reception) are not known before
     the topic's type; `error` says why its type has no such field. `lacking` messages were without
-    it; `why`: the latest one of them.
+    it; `why`: the latest one of them. `offset` is the time from the stamp of the latest message to
+    its publication (ns).
     """
 
     def __init__(self, wanted: Input, take: Take, source: 'Source', is_sample: bool) -> None:
@@ -52,7 +54,7 @@ class Listener:
         self.source, self.is_sample = source, is_sample
         self.field: Field | None = None
         self.stamps = self.error = self.element = ''
-        self.lacking = 0
+        self.lacking = self.offset = 0
         self.why: MissingElementError | None = None
         self._unwrap: Unwrapper | None = None
 
@@ -82,7 +84,8 @@ class Listener:
         if self._unwrap:
             value = self._unwrap(value)
         stamp = header if self.stamps == 'header' else info[STAMPS[self.stamps]]
-        self._take(stamp, value, info['source_timestamp'])
+        self.offset = info['source_timestamp'] - stamp if stamp else 0
+        self._take(stamp, value)
         return True
 
 
@@ -93,7 +96,9 @@ class Source:
     `message_type` is '' while it is not known. Of the publishers that `look` has seen, by their
     gid, `heard` are the names of nodes that can be heard; of the others `unheard` has a sentence
     that names the node and says what to do about it. `lost` and `damaged` count messages that did
-    not arrive or are shorter than their type. `on_names` is called with the names in each message.
+    not arrive or are shorter than their type. `delay` is the longest time from a publication to
+    its callback between the latest two looks (ns). `on_names` is called with the names in each
+    message.
     """
 
     def __init__(self, node: Node, sources: 'Sources', topic: str) -> None:
@@ -103,6 +108,7 @@ class Source:
         self.heard: dict[Gid, str] = {}
         self.unheard: dict[Gid, str] = {}
         self.lost = self.damaged = 0
+        self.delay = self._delay = -math.inf
         self.on_names: Callable[[list[str]], None] | None = None
         self._sequence, self._mixed = 0, False
         self.listeners: list[Listener] = []
@@ -138,6 +144,7 @@ class Source:
         """
         if not self._subscribed:
             return
+        self.delay, self._delay = self._delay, -math.inf
         before, told = self.heard, self.unheard
         self.heard, self.unheard = {}, {}
         for endpoint in self._node.get_publishers_info_by_topic(self.topic):
@@ -206,6 +213,7 @@ class Source:
             self._qos = subscription.qos_profile
 
     def _on_message(self, data: bytes, info: Mapping[str, Any]) -> None:
+        self._delay = max(self._delay, time_ns() - info['source_timestamp'])
         sequence = info['publication_sequence_number'] or 0  # 0: the middleware has none
         if 0 < sequence <= self._sequence:  # another publisher's
             self._mixed = True  # until `look` has seen how many there are
