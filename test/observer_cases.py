@@ -48,6 +48,14 @@ def states_of(rates, d, start=0.0, period=1e-3):
     return z
 
 
+def discrete(rates, drive, period):
+    """Return transition and noise of x' = rates x + w over a period (Van Loan 1978)."""
+    n = len(rates)
+    whole = expm(np.block([[-rates, drive], [np.zeros_like(rates), rates.T]]) * period)
+    transition = whole[n:, n:].T
+    return transition, transition @ whole[:n, n:]
+
+
 def matern(count, rate, derivatives, rng):
     """Return a d of size 1 at 1 kHz with so many derivatives, its corner at `rate` (rad/s)."""
     d = rng.standard_normal(count + 4000)
