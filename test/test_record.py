@@ -157,15 +157,6 @@ def test_full_disk_leaves_what_was_recorded(live, tmp_path):
     assert len(stamps(tmp_path / 'bag', '/y')) > 1500
 
 
-def plant_package(folder, name):
-    """Write a package of messages whose import leaves a file; return that file."""
-    mark = folder / 'imported'
-    (folder / name / 'msg').mkdir(parents=True)
-    (folder / name / '__init__.py').write_text(f"open({str(mark)!r}, 'w').close()\n")
-    (folder / name / 'msg' / '__init__.py').write_text('class Thing:\n    pass\n')
-    return mark
-
-
 def test_bag_is_played_in_its_own_time_and_an_estimator_restarts_where_it_begins_again(tmp_path):
     """With names, remappings and the arguments that launch adds, also those without a meaning."""
     remapped = (
@@ -173,8 +164,6 @@ def test_bag_is_played_in_its_own_time_and_an_estimator_restarts_where_it_begins
         '-p', 'use_sim_time:=true', '--params-file', tmp_path / 'none.yaml',
     )  # fmt: skip
     (tmp_path / 'none.yaml').write_text('none: {ros__parameters: {}}')
-    # The names in a bag come from strangers: a package beside it is not imported.
-    mark = plant_package(tmp_path, 'planted_msgs')
     files.TYPES.register(get_types_from_msg('float64 data', 'planted_msgs/msg/Thing'))
     stamps, y = files.signal(1000)
     thing = '/x', 'planted_msgs/msg/Thing', int(stamps[-1]), files.float64(1.0)
@@ -194,16 +183,19 @@ def test_bag_is_played_in_its_own_time_and_an_estimator_restarts_where_it_begins
         said = [interrupted(process)[0] for process in processes]
     assert 'not played: /x: planted_msgs/msg/Thing is not installed here' in said[0]
     assert 'playing 1 topics' in said[0]
-    assert not mark.exists()
     with BagReader(tmp_path / 'out') as reader:
         times = [time for _, time, _, _ in reader.messages(['/rig/y'])]
     assert (times[-1] - times[0]) / len(times) > 200_000  # 1 ms, less what play was held up
 
 
 def test_only_installed_message_types_have_a_class(tmp_path, monkeypatch):
+    """Names in a bag come from strangers: no other package that has such a name is imported."""
     assert message_class('std_msgs/msg/Float64').__name__ == 'Float64'
     site_packages = tmp_path / 'install' / 'lib' / 'python3' / 'site-packages'
-    mark = plant_package(site_packages, 'workspace_msgs')
+    package, mark = site_packages / 'workspace_msgs', tmp_path / 'imported'
+    (package / 'msg').mkdir(parents=True)
+    (package / '__init__.py').write_text(f"open({str(mark)!r}, 'w').close()\n")
+    (package / 'msg' / '__init__.py').write_text('class Thing:\n    pass\n')
     monkeypatch.syspath_prepend(site_packages)
     for name in ('workspace_msgs/msg/Thing', 'std_msgs/msg/Nothing', 'os/msg/Path', ''):
         with pytest.raises(LookupError, match='expected a message type that is installed here'):
