@@ -56,11 +56,11 @@ def discrete(rates, drive, period):
     return transition, transition @ whole[:n, n:]
 
 
-def matern(count, rate, derivatives, rng):
-    """Return a d of size 1 at 1 kHz with so many derivatives, its corner at `rate` (rad/s)."""
+def matern(count, rate, derivatives, rng, period=1e-3):
+    """Return a d of size 1 with so many derivatives, its corner at `rate` (rad/s)."""
     d = rng.standard_normal(count + 4000)
     for _ in range(derivatives + 1):
-        d = lfilter([1.0], [1.0, -math.exp(-rate * 1e-3)], d)
+        d = lfilter([1.0], [1.0, -math.exp(-rate * period)], d)
     return d[4000:] / d[4000:].std()
 
 

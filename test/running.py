@@ -109,7 +109,8 @@ class Process(Child):
     def check_end(self) -> None:
         """Wait for the end after `interrupt`: a good one, with nothing terrible said."""
         assert self._may_end or self.wait() == 0, self.output()
-        assert 'Traceback' not in self.output(), self.output()
+        for word in ('Traceback', 'Exception', 'terminate called'):
+            assert word not in self.output(), self.output()
 
 
 Published = namedtuple('Published', 'stamp message')

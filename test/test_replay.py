@@ -215,16 +215,3 @@ def test_csv_file_is_estimated_as_its_arrays(tmp_path, first, delimiter, argumen
     with np.load(tmp_path / 'my.npz') as found:
         np.testing.assert_array_equal(found['stamp_ns'], stamps[used])
         np.testing.assert_array_equal(found['unknown_input'], expected.unknown_input[used])
-
-
-@pytest.mark.parametrize(('text', 'columns', 'said'), [
-    ('t,y,u\n0,1,2\n0.001,x,3\n', '', 'my.csv: expected lines of numbers: could not convert str'),
-    ('', '', '--columns: expected 3 titles, of the time, y, torque, got'),
-    ('t,angle,u\n0,1,2\n', 't,anlge,u', "t, angle, u, got 'anlge'; did you mean 'angle'?"),
-    ('t,y,u\nnan,1,2\n', '', 'my.csv: expected times of 0 to 9.2e+09 s, got nan in sample 0'),
-])  # fmt: skip
-def test_bad_table_is_said_in_one_line(tmp_path, capsys, text, columns, said):
-    (tmp_path / 'my.csv').write_text(text)
-    assert run_table(tmp_path / 'my.csv', '--columns', columns) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert said in line

@@ -12,6 +12,7 @@ TUNE = (
     'tune -o out -pscheme:=explicit -pduration:=4.0 -pintegration_step:=1e-3 -psample_rate:=200.0 '
     '-precordings:=1 -pheld_out:=1 -psettled:=1.0 '
 )
+TABLE = "replay -p order:=2 -p phi:=['0','torque'] -p inputs:=[torque] "
 WRONG = {
     # Bags.
     'replay /no/bag': ['/no/bag', 'does not exist'],
@@ -22,6 +23,11 @@ WRONG = {
     'replay joints -p input_field:=position[3]': ['position[3]', '3 in one message'],
     'replay sqlite -p input_stamp:=source': ['input_stamp source: expected an mcap bag'],
     'replay bag --columns t,y': ['--columns: expected a .csv file, got'],
+    # Tables.
+    f'{TABLE} text.csv': ['text.csv: expected lines of numbers: could not convert str'],
+    f'{TABLE} none.csv': ['--columns: expected 3 titles, of the time, y, torque, got'],
+    f'{TABLE} late.csv --columns t,anlge,u': ["t, angle, u, got 'anlge'; did you mean 'angle'?"],
+    f'{TABLE} late.csv': ['late.csv: expected times of 0 to 9.2e+09 s, got nan in sample 0'],
     # Parameters.
     'replay bag -p input_topic:=/yy': ["'/yy'", '(/y)', "did you mean '/y'?"],
     'replay bag -p input_field:=date': ["'date'", "did you mean 'data'?"],
@@ -76,6 +82,9 @@ def place(tmp_path_factory):
         x = writer.add_connection('/x', files.FLOAT, typestore=files.TYPES)
         writer.write(x, 5, files.float64(1.0))
     files.write(place / 'joints', [('/y', files.JOINTS, 5, files.joint_state(5, [1.0, 2.0, 3.0]))])
+    (place / 'text.csv').write_text('t,y,u\n0,1,2\n0.001,x,3\n')
+    (place / 'late.csv').write_text('t,angle,u\nnan,1,2\n')
+    (place / 'none.csv').touch()
     (place / 'lamda.yaml').write_text('estimator: {ros__parameters: {lamda: 1.0}}')
     (place / 'node.yaml').write_text('estimater: {ros__parameters: {}}')
     text = shipped('config/demo.yaml').read_text()

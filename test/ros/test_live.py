@@ -3,7 +3,6 @@
 
 import itertools
 import math
-import time
 
 from diagnostic_msgs.msg import DiagnosticArray
 from fhaosmo_ros.core.observer.estimates import TUNING
@@ -174,6 +173,10 @@ def test_a_common_value_that_one_channel_cannot_take_is_refused_for_all(rigs):
     assert parameters.all(names) == before
 
 
+def stamp_of(message: JointState) -> int:
+    return nanoseconds(message.header.stamp)
+
+
 class Arm(Rig):
     """An estimator of whatever joints come, fed and heard."""
 
@@ -190,18 +193,13 @@ class Arm(Rig):
         return self.stamp
 
     def answer(self, **positions):
-        """Return the estimates of a message; it is sent again, five times a second, until then."""
-        begin, latest = self.stamp, -math.inf
-
-        def answered() -> bool:
-            nonlocal latest
-            if time.monotonic() > latest + 0.2:
-                self.send(**positions)
-                latest = time.monotonic()
-            return self.out and nanoseconds(self.out[-1].message.header.stamp) > begin
-
-        self.user.wait(answered, f'estimates of {len(positions)} joints')
-        return self.out[-1].message
+        """Return the estimates of a message, which is sent again and again until they come."""
+        begin, out = self.stamp, self.out
+        self.user.wait(
+            lambda: self.send(**positions) and out and stamp_of(out[-1].message) > begin,
+            f'estimates of {len(positions)} joints',
+        )
+        return out[-1].message
 
 
 @pytest.fixture
@@ -218,9 +216,7 @@ def test_each_joint_is_a_channel_whatever_the_order_of_the_names(user, arm):
     arm.answer(shoulder=0.1, elbow=0.2, wrist=0.3)
     for k in range(24):
         stamp = arm.send(**{name: 0.1 * len(name) + 0.01 * k for name in orders[k % 3]})
-        user.wait(
-            lambda stamp=stamp: nanoseconds(arm.out[-1].message.header.stamp) == stamp, 'estimates'
-        )
+        user.wait(lambda stamp=stamp: stamp_of(arm.out[-1].message) == stamp, 'estimates')
     estimators = {name: OnlineEstimator({'max_gap': 60.0}) for name in orders[0]}
     estimators['elbow'].configure({'epsilon': 7.0})
     expected = {
@@ -230,8 +226,7 @@ def test_each_joint_is_a_channel_whatever_the_order_of_the_names(user, arm):
     for _, message in arm.out:
         rows = zip(message.name, message.position, message.velocity, message.effort, strict=True)
         assert {name: numbers for name, *numbers in rows} == {
-            name: [*e.z[:2], e.unknown_input]
-            for name, e in expected[nanoseconds(message.header.stamp)].items()
+            name: [*e.z[:2], e.unknown_input] for name, e in expected[stamp_of(message)].items()
         }
     assert arm.said("expected a name that is in the message (elbow, wrist), got 'shoulder'")
     assert arm.said("parameters of 'elbo' are not used", "did you mean 'elbow'")
