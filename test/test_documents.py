@@ -2,12 +2,11 @@
 """Pages and shipped configurations: what they show is accepted, runs, and leads somewhere."""
 
 import contextlib
-from pathlib import Path
 import re
 import subprocess
 import sys
 
-from commands import environment
+from commands import environment, ROOT
 from fhaosmo_ros import topics
 from fhaosmo_ros.__main__ import main
 from fhaosmo_ros.commands import COMMANDS
@@ -20,7 +19,6 @@ import pytest
 from studies.parameter_reference import markdown
 import yaml
 
-ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = 'fhaosmo_ros'
 CONFIGURATIONS = sorted((ROOT / 'config').glob('**/*.yaml'))
 PAGES = {

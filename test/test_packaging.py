@@ -11,12 +11,12 @@ import sys
 from types import SimpleNamespace
 from unittest.mock import MagicMock
 
+from commands import ROOT
 import fhaosmo_ros
 from fhaosmo_ros.__main__ import main
 from fhaosmo_ros.commands import COMMANDS
 import pytest
 
-ROOT = Path(__file__).resolve().parents[1]
 NAME = 'fhaosmo_ros'
 # A sourced ROS or overlay would leak into the builds and plans below.
 SOURCED = ('AMENT_PREFIX_PATH', 'CMAKE_PREFIX_PATH', 'COLCON_PREFIX_PATH', 'ROS_DISTRO')

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The commands record, play and demo beside live nodes: complete bags, and no process left."""
 
+from contextlib import suppress
 import os
 import re
 import shlex
@@ -19,6 +20,7 @@ from fhaosmo_ros.tools.bags.reader import BagReader
 from fhaosmo_ros.tools.bags.topics import read_ticks, series
 from fhaosmo_ros.tools.demo import OTHERS, read_run
 from fhaosmo_ros.topics import ESTIMATES, EVENT, PARAMETERS, SNAPSHOT
+from mcap.reader import NonSeekingReader
 import numpy as np
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import get_types_from_msg
@@ -39,7 +41,12 @@ def size(folder):
 
 
 def stamps(folder, topic):
-    return files.stamps_in(folder / f'{folder.name}_0.mcap', topic)
+    """Stamps of a topic in a storage file that is not complete: it grows, or was cut."""
+    found = []
+    with suppress(Exception), (folder / f'{folder.name}_0.mcap').open('rb') as file:
+        for _, _, message in NonSeekingReader(file).iter_messages([topic], log_time_order=False):
+            found.append(message.log_time)
+    return found
 
 
 def wait_for_more(bag, length, process):

@@ -3,8 +3,8 @@
 
 from functools import cache
 import math
-from pathlib import Path
 
+from commands import ROOT
 from fhaosmo_ros.core.observer.observer import Observer
 from fhaosmo_ros.core.observer.status import Status
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
@@ -19,7 +19,7 @@ import pytest
 from scipy.optimize import brentq
 from scipy.stats import norm
 
-CONFIG = Path(__file__).resolve().parents[1] / 'config'
+CONFIG = ROOT / 'config'
 FILES = [
     path for path in sorted(CONFIG.glob('**/*.yaml'))
     if {'noise_size', 'correction_period'} <= load(path, 'estimator', ONLINE_PARAMETERS).keys()

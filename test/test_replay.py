@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """A bag, or a CSV file, replayed is the observer's own result."""
 
-from pathlib import Path
 import sqlite3
 
 import bag_files as files
+from commands import ROOT
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.parameters.files import dumps
 from fhaosmo_ros.tools.bags.reader import BagReader
@@ -14,7 +14,6 @@ from fhaosmo_ros.tools.replay import command as replay
 import numpy as np
 import pytest
 
-ROOT = Path(__file__).resolve().parents[1]
 STAMPS, Y = files.signal(3000)
 
 
@@ -190,11 +189,6 @@ SINE, U = 0.1 * np.sin(T), np.cos(9.0 * T)
 MODEL = {'order': 2, 'phi': ['0', '-z1 + torque'], 'inputs': ['torque']}
 
 
-def run_table(path, *arguments):
-    given = [text for name, value in MODEL.items() for text in ('-p', f'{name}:={value}')]
-    return run(path, *given, '-o', path.with_suffix('.npz'), *arguments)
-
-
 @pytest.mark.parametrize(('first', 'delimiter', 'arguments'), [
     ('t,angle,torque', ',', []),
     ('torque;x;"angle";t', ';', ['--columns', 't, angle, torque']),
@@ -208,7 +202,8 @@ def test_csv_file_is_estimated_as_its_arrays(tmp_path, first, delimiter, argumen
     lines = [delimiter.join(map(repr, map(float, row))) for row in zip(*columns, strict=True)]
     path = tmp_path / 'my.csv'
     path.write_text('\n'.join([first, *lines][not first :]).replace('nan', ''))
-    assert run_table(path, *arguments) == 0
+    given = [text for name, value in MODEL.items() for text in ('-p', f'{name}:={value}')]
+    assert run(path, *given, '-o', tmp_path / 'my.npz', *arguments) == 0
     stamps = np.maximum(np.round(T * 1e9).astype(np.int64), 1)
     expected = OnlineEstimator(MODEL).run(stamps, y, U)
     used = np.isfinite(y)
