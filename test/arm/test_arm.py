@@ -166,14 +166,6 @@ def test_positions_that_freeze_stop_the_estimates(free, measurement):
     assert np.abs(run(arm, free, 2000, 3000).external_torque[-500:]).max() < 0.5
 
 
-def test_a_driver_that_repeats_each_position_is_one_of_half_the_rate(free):
-    arm, (t, *arrays) = Arm(URDF), free
-    found = run(arm, (t, *(np.repeat(array[::2], 2, axis=0) for array in arrays)))
-    assert arm.counters['standing still'] > 0.4 * len(t)
-    once = run(Arm(URDF), [array[::2] for array in free])
-    assert rms(found.external_torque[500:]) < 1.5 * rms(once.external_torque)
-
-
 @pytest.mark.parametrize(('number', 'apart'), [(1, 1e-9), (100, 1e-6)])
 def test_samples_that_nearly_coincide_are_no_jump_and_do_no_harm(free, number, apart):
     """Velocities of 10,000 rad/s: C^T qd, their square, would drive the next estimate."""

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a recording of free motion says of an arm, and the file and commands around it."""
 
-from importlib import import_module
-
 import numpy as np
 import pytest
 
@@ -60,7 +58,7 @@ def test_noise_is_found_and_stays_finite_for_a_quantised_encoder(found):
 
 
 def test_links_that_cannot_exist_are_not_found():
-    pseudo_inertia = import_module('pinocchio').PseudoInertia.FromDynamicParameters
+    pseudo_inertia = pytest.importorskip('pinocchio').PseudoInertia.FromDynamicParameters
     model = ArmModel(URDF)
     model.set_payload(Payload(0.5, (0.0, 0.0, 0.4)))
     # So much noise that plain fits leave physics.

@@ -18,13 +18,10 @@ from std_srvs.srv import Trigger
 
 MIXED = ['wheel', 'elbow', 'turn', 'shoulder']
 ORDER = [JOINTS.index(name) for name in MIXED[1:]]
-PUSH = np.array([0.0, -6.0, -5.0])
 MOTION = motion(ArmModel(URDF), 1e-3 * np.arange(6000))
-WRENCH = 'external_wrench'
 FIELDS = {
     'external_torque': 'effort', 'joint_states': 'velocity', 'standard_deviation': 'effort',
 }  # fmt: skip
-"""What a node and a library are compared by."""
 
 
 class Limb(Rig):
@@ -63,7 +60,7 @@ def limb(launch, user):
     """Return an arm node that has heard its robot's description, and everything around it."""
     options = {'wrench_frame': 'tool', 'publish_rate': 5000.0, 'diagnostics_period': 0.2}
     limb = Limb(user, launch('arm', namespace='/limb', **options), '/limb')
-    limb.wrenches = user.record(f'{limb.name}/{WRENCH}', WrenchStamped)
+    limb.wrenches = user.record(f'{limb.name}/external_wrench', WrenchStamped)
     limb.events = user.record(f'{limb.name}/event', DiagnosticArray, LATCHED)
     limb.description = user.publisher('/limb/robot_description', String, qos=LATCHED)
     limb.wait_said('waiting for the robot on /limb/robot_description')
@@ -93,7 +90,7 @@ def test_node_and_library_agree_on_the_same_samples(limb, user):
 
 def test_a_contact_is_an_event_with_its_link_and_ends(limb, user):
     begun = len(limb.events)
-    limb.estimate(range(500, 700), PUSH)
+    limb.estimate(range(500, 700), np.array([0.0, -6.0, -5.0]))
     user.wait(lambda: len(limb.events) > begun, 'event')
     status = limb.events[begun].message.status[0]
     assert (status.level, status.name) == (WARN, 'limb/arm: contact')

@@ -2,7 +2,6 @@
 """Life of a node: the services that `ros2 lifecycle` calls, and signals, whenever they come."""
 
 import signal
-import time
 
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
@@ -148,17 +147,6 @@ def test_a_signal_ends_it_in_every_state(user, launch, transition):
     assert not transition or manager.change(transition)
     process.send_signal(signal.SIGINT)
     assert process.wait(GRACE) == 0
-
-
-@pytest.mark.parametrize('delay', [0.3, 0.7])
-def test_signal_while_it_starts(launch, delay):
-    """The delay is the test's subject: anywhere within the start, or just behind it."""
-    process = launch('estimator', namespace='/early')
-    time.sleep(delay)
-    process.send_signal(signal.SIGTERM)
-    process.send_signal(signal.SIGINT)
-    # Python itself dies of a signal before it has begun with our code.
-    assert process.wait(GRACE) in (0, -signal.SIGTERM, -signal.SIGINT), process.output()
 
 
 STUCK = """
