@@ -279,13 +279,6 @@ def test_spikes_beyond_epsilon_are_no_divergence_while_y_is_found_again():
     feed.only()
 
 
-def test_bad_input_is_not_held():
-    estimator = OnlineEstimator({'phi': ['0', '0', 'u']})
-    assert [estimator.set_input(u) for u in (2.0, math.nan, -math.inf)] == [True, False, False]
-    assert estimator.inputs == (2.0,)
-    assert (estimator.counters.rejected_inputs, estimator.counters.rejected) == (2, 0)
-
-
 def test_frozen_gamma_stays_and_the_rest_goes_on():
     feed, other = Feed(gamma_rate=0.5), Feed(gamma_rate=0.5)
     for f in (feed, other):

@@ -17,7 +17,7 @@ from commands import COMMAND, environment, interrupted, ROOT, run, start, wait_u
 from domains import take_domain
 from fhaosmo_ros.nodes.middleware.messages import message_class
 from fhaosmo_ros.tools.bags.reader import BagReader
-from fhaosmo_ros.tools.bags.topics import read_ticks, series
+from fhaosmo_ros.tools.bags.topics import read_ticks
 from fhaosmo_ros.tools.demo import OTHERS, read_run
 from fhaosmo_ros.topics import ESTIMATES, EVENT, PARAMETERS, SNAPSHOT
 from mcap.reader import NonSeekingReader
@@ -231,7 +231,7 @@ def test_run_leaves_a_report_a_figure_and_a_bag_but_no_process(tmp_path):
     assert (folder / 'report.txt').read_text().strip() in out
     with AnyReader([folder / 'bag']) as reader:
         topics = {c.topic for c in reader.connections}
-    found = [f'/estimator/{part}' for part in (*ESTIMATES, SNAPSHOT, PARAMETERS)]
+    found = [f'/estimator/{part}' for part in (*ESTIMATES, 'tuning', SNAPSHOT, PARAMETERS)]
     assert {'/y', '/plant/state', '/plant/unknown_input', *found} <= topics
     run_ = read_run(folder / 'bag')
     assert len(run_.y.stamps) > 1000
@@ -240,12 +240,6 @@ def test_run_leaves_a_report_a_figure_and_a_bag_but_no_process(tmp_path):
     # Not d: other tests load the machine meanwhile, and its stamps jitter in bursts then.
     error = np.median(np.abs(run_.errors[late, :2]), axis=0)
     assert (error < 0.05 * np.abs(run_.curves.truth[late, :2]).max(axis=0)).all()
-    # Of the last samples that are not the same: estimates go on where the plant ends first.
-    end = np.unique(run_.rows, return_index=True)[1][-50:]
-    true = np.std(run_.y.values.ravel()[run_.rows[end]] - run_.curves.truth[end, 0])
-    assert true > 0.5e-4
-    noise = np.median(series(folder / 'bag', '/estimator/tuning').values[-500:, 0])
-    assert noise > 0.5 * true  # jitter of a busy machine adds to it
 
 
 def test_ctrl_c_ends_early_with_a_report_and_without_a_trace(tmp_path):

@@ -277,16 +277,6 @@ def test_y_that_stands_still_says_no_more_with_every_sample():
     assert 0.1 < deviation.min() <= deviation.max() < 0.5
 
 
-def test_slider(case):
-    """A larger bandwidth makes the estimate noisier; 1 is what it chooses."""
-    t, z, _, noise = case
-    y, roughness = z[:8000, 0] + 1e-3 * noise[:8000], []
-    for bandwidth in (0.3, 1.0, 3.0):
-        run = Observer({**SELF_TUNING, 'bandwidth': bandwidth}).run(t[:8000], y)
-        roughness.append(rms(np.diff(run.unknown_input[4000:])))
-    assert roughness[0] < 0.5 * roughness[1] < 0.25 * roughness[2]
-
-
 @pytest.mark.parametrize(('name', 'kind', 'seed'), [
     ("paper's plant", 'sine', 20), ('motor', 'ou', 14), ('pendulum', 'square', 3),
 ])  # fmt: skip

@@ -53,6 +53,8 @@ WRONG = {
     # tune
     f'{TUNE} -pnoise:=1': ["unknown parameter 'noise'"],
     f'{TUNE} -pweights:=[1.0,2.0]': ['weights', '1 or 4 numbers'],
+    f'{TUNE} -pband_of_d:=[3.0,1.0]': ['band_of_d', 'lower one first'],
+    f'{TUNE} -pphi:=[0,0,z3**3] -prms_of_d:=100.0': ['expected states that stay finite'],
     f'{TUNE} -psettled:=4.0': ['more than 4 s'],
     f'{TUNE} --trials=0': ['--trials >= 1'],
     f'{TUNE} --storage nodb://x': ['storage'],

@@ -98,9 +98,7 @@ def test_torque_constants_are_found_by_gravity_or_taken_from_other_joints():
 
 def test_the_file_gives_back_what_was_written_and_others_are_refused(found):
     text = found.calibration.dumps()
-    again = Calibration.loads(text)
-    np.testing.assert_array_equal(again.inertial, found.calibration.inertial)
-    np.testing.assert_array_equal(again.coulomb, found.calibration.coulomb)
+    assert Calibration.loads(text).dumps() == text
     for old, new, expected in (
         ('offset:', 'ofset:', 'missing or unknown are offset, ofset'),
         ('  - elbow\n', '', 'numbers of shape'),
