@@ -61,9 +61,7 @@ FAULTS = {
     'late': ({}, [(-3, 5.0), (-499, 5.0), (1, 0.21)], 'xx-', {'backward_stamps': 2}),
     'no stamp': ({}, [(NO_STAMP, 5.0), (1, 0.21)], 'x-', {'zero_stamps': 1}),
     'a gap': ({}, of(300), 'g', {'gaps': 1, 'sub_steps': 300}),
-    'an hour': (
-        {'max_gap': 3600.0}, of(HOUR - 1), 'g', {'gaps': 1, 'sub_steps': 10_000}
-    ),
+    'an hour': ({'max_gap': 3600.0}, of(HOUR - 1), 'g', {'gaps': 1, 'sub_steps': 10_000}),
     'set back a little': (
         {}, of(*range(-99, 50)), 'x' * 100 + '-' * 49,
         {'backward_stamps': 99, 'duplicate_stamps': 1},

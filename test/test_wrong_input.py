@@ -7,6 +7,7 @@ import bag_files as files
 from fhaosmo_ros.__main__ import main
 from fhaosmo_ros.tools.cli.command import shipped
 import pytest
+from robots import URDF
 
 TUNE = (
     'tune -o out -pscheme:=explicit -pduration:=4.0 -pintegration_step:=1e-3 -psample_rate:=200.0 '
@@ -40,6 +41,11 @@ WRONG = {
     'plot both -o x.jpg': ['.png, .svg, .pdf', 'x.jpg'],
     'plot both --names /no': ['/estimator', "'/no'"],
     'plot bag': ['topics of an estimator', '/y'],
+    # arm
+    'calibrate --bag joints --payload': ['calibration_file:=FILE'],
+    'calibrate --bag joints': ['one robot on /robot_description', '--robot URDF'],
+    'calibrate --bag joints --robot three.urdf': ['messages on /joint_states, got none'],
+    'calibrate --bag joints --robot three.urdf --topic /y': ['joint states of turn', 'lacks'],
     # play, record, demo
     'play bag --delay -1': ['--delay', '0 to 3600', '-1'],
     'play bag --topics /x': ["'/x'", '/y'],
@@ -84,6 +90,7 @@ def place(tmp_path_factory):
         x = writer.add_connection('/x', files.FLOAT, typestore=files.TYPES)
         writer.write(x, 5, files.float64(1.0))
     files.write(place / 'joints', [('/y', files.JOINTS, 5, files.joint_state(5, [1.0, 2.0, 3.0]))])
+    (place / 'three.urdf').write_text(URDF)
     (place / 'text.csv').write_text('t,y,u\n0,1,2\n0.001,x,3\n')
     (place / 'late.csv').write_text('t,angle,u\nnan,1,2\n')
     (place / 'none.csv').touch()
@@ -99,6 +106,8 @@ def test_wrong_input_is_said_in_one_line_and_leaves_nothing(call, place, capfd, 
     command, *arguments = shlex.split(call)
     if command in ('demo', 'play', 'record'):
         pytest.importorskip('rclpy', reason='no ROS 2 in this Python')
+    elif command == 'calibrate':
+        pytest.importorskip('pinocchio', reason='pinocchio is not installed (extra: arm)')
     elif '--storage' in arguments:
         pytest.importorskip('optuna', reason='optuna is not installed (extra: tune)')
     monkeypatch.chdir(place)

@@ -112,7 +112,7 @@ def test_the_file_gives_back_what_was_written_and_others_are_refused(found):
             Calibration.loads(text)
 
 
-def test_commands_calibrate_and_replay_a_bag(tmp_path, capsys):
+def test_commands_calibrate_and_replay_a_bag(tmp_path):
     messages = [('/robot_description', TEXT, 1, files.serialise(TEXT, data=URDF))]
     for t, q, torque in zip(*recorded(duration=15.0), strict=True):
         stamp = 10**9 + round(t * 1e9)
@@ -126,8 +126,3 @@ def test_commands_calibrate_and_replay_a_bag(tmp_path, capsys):
     rows = np.genfromtxt(table, delimiter=',', skip_header=1, usecols=range(7))
     assert np.abs(rows[500:, 1:4]).mean() < 0.5
     assert Calibration.loads(file.read_text()).log_odds >= calibrate.LEAST
-    assert calibrate.main(['--bag', str(bag), '--payload']) == 2
-    assert calibrate.main(['--bag', str(bag), '--topic', '/none']) == 2
-    errors = capsys.readouterr().err
-    assert 'calibration_file:=FILE' in errors
-    assert 'expected messages on /none, got none' in errors

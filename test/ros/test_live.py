@@ -105,10 +105,7 @@ def test_live_events_are_those_of_a_replay(user, estimator):
     wait_last('events are switched off')
 
 
-OWN = {
-    'hip': {'variant': 'sign', 'lambda': [15.0]},
-    'knee': {'order': 2, 'phi': ['0', '-z2']},
-}
+OWN = {'hip': {'variant': 'sign', 'lambda': [15.0]}, 'knee': {'order': 2, 'phi': ['0', '-z2']}}
 COMMON = {'max_gap': 60.0, 'epsilon': 5.0}
 
 
