@@ -97,7 +97,6 @@ def test_unknown_and_old_names_are_told():
     ({'unknown_input': False, 'unknown_input_derivatives': 1}, 'expected unknown_input = true'),
     ({'scheme': 'predict_correct'}, "scheme = 'explicit' or 'implicit' with cascade"),
     ({'structure': 'levant', 'unknown_input': False}, 'unknown_input = true'),
-    ({'structure': 'levant', 'scheme': 'explicit'}, "scheme = 'implicit' or 'predict"),
     ({'gains': 'self_tuning', 'unknown_input': False}, 'unknown_input'),
 ])  # fmt: skip
 def test_values_that_do_not_fit_together_are_refused(values, reason):

@@ -134,4 +134,5 @@ def test_root_of_levants_structure(variant, b, h, gamma, lambdas, width):
     assert np.all((s >= 0.0) & (s <= 1.0 + 1e-15))
     terms = np.append(weights * w ** np.arange(3, -1, -1) * s, eps)
     np.testing.assert_allclose(terms.sum(), b, rtol=1e-11)
-    np.testing.assert_allclose(h * estimate.z[1], terms[1:4].sum(), rtol=1e-9)
+    shares = [1.0, 3.0 / 2.0, 11.0 / 6.0]  # of the second level, beta of D 18
+    np.testing.assert_allclose(h * estimate.z[1], shares @ terms[1:4], rtol=1e-9)

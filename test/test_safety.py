@@ -106,7 +106,6 @@ def test_hostile_snapshots(kind):
 @pytest.mark.parametrize('kind', ['cascade', 'self-tuning'])
 def test_two_threads_on_one_estimator_get_an_error(kind):
     estimator, stamps = running(KINDS[kind], 100, 1), 2 * 10**9 + np.arange(20_000) * 10**6
-
     refused = pytest.raises(RuntimeError, match='another thread')
     with refused, ThreadPoolExecutor(1) as other:
         for _ in range(100):
@@ -115,3 +114,11 @@ def test_two_threads_on_one_estimator_get_an_error(kind):
                 estimator.update(0, 0.1)
             run.result()
     assert np.isfinite(estimator.observer.estimate.z).all()
+
+
+def test_compiled_code_takes_no_arrays_of_other_sizes():
+    """It reads arrays without looking at their ends: who calls it from Python is refused."""
+    policy, none = running({}, 50, 5).policy, np.zeros((len(Y), 0))
+    for arrays in ((STAMPS[:2], Y, none), (STAMPS, Y, none[:2]), (STAMPS, Y, np.zeros((200, 2)))):
+        with pytest.raises(ValueError, match=r'expected|arrays'):
+            policy.run(*arrays)

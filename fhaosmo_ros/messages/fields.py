@@ -88,15 +88,13 @@ class Field(NamedTuple):
             if isinstance(step, str):
                 around, node = node, getattr(node, step)
                 continue
-            index = step
-            if isinstance(step, Key):
-                names = getattr(around, step.names)
-                if step.name not in names:
-                    raise MissingElementError(self.text, step, names)
-                index = names.index(step.name)
-            if index >= len(node):
-                raise MissingElementError(self.text, step, len(node))
-            node = node[index]
+            names = getattr(around, step.names) if isinstance(step, Key) else []
+            try:
+                node = node[names.index(step.name) if isinstance(step, Key) else step]
+            except ValueError:
+                raise MissingElementError(self.text, step, names) from None
+            except IndexError:
+                raise MissingElementError(self.text, step, len(node)) from None
         if self.angle:
             return angle_of(self.angle, around.x, around.y, around.z, around.w)
         return float(node[0] if isinstance(node, bytes) else node)  # a byte of rclpy

@@ -19,8 +19,6 @@ FIXED_GAMMA = 0.5
 """Power of the variants that do not adapt (paper eq. triangularObserver, fuzzysuper)."""
 STEP = 0.1
 """Of a prediction, in parts of the time constant of the fastest motion of the model at rest."""
-SCHEMES = {'cascade': ('explicit', 'implicit'), 'levant': ('implicit', 'predict_correct')}
-"""The two of each structure."""
 DERIVATIVES = 3
 """Derivatives of d that a self-tuning observer has behind it (D 26)."""
 
@@ -106,8 +104,8 @@ class ObserverConfiguration:
         return {'settled': 1.0}  # P is of other sizes, or there is none
 
     def _complete_self_tuning(self) -> None:
-        self.levant = self.predicting = self.implicit = True
-        self.internal = self.adaptive = self.is_sign = False
+        self.predicting = self.implicit = True
+        self.levant = self.internal = self.adaptive = self.is_sign = False
         self.gamma_initial, self.epsilon = 0.0, np.inf  # no power, no gates
         self.levels = self.model.order + 1 + DERIVATIVES
         self.initial_estimate = self.initial_internal = np.zeros(self.levels)
@@ -115,9 +113,8 @@ class ObserverConfiguration:
 
     def _complete_fixed_gains(self) -> None:
         p, n = self.parameters, self.model.order
-        self.levant = p['structure'] == 'levant'
-        self.predicting = p['scheme'] == 'predict_correct'
-        self.implicit = p['scheme'] != 'explicit'
+        self.levant = self.predicting = p['structure'] == 'levant'
+        self.implicit = self.levant or p['scheme'] == 'implicit'
         self.internal = p['estimate_from'] == 'internal'
         adaptive = p['variant'].endswith('_adaptive')
         self.adaptive = adaptive and not self.levant
@@ -149,7 +146,7 @@ class ObserverConfiguration:
         rate = p['unknown_input_decay'] or p['unknown_input_rate']
         usual = p['unknown_input_size'] / rate ** np.arange(n, 0.0, -1.0)  # d integrated
         self.state_sizes = np.where(self.state_sizes > 0.0, self.state_sizes, usual)
-        starts = not self.levant or (self.predicting and p['correction_period'] > 0.0)
+        starts = not self.levant or p['correction_period'] > 0.0
         if p['noise_size'] > 0.0 and p['unknown_input'] and starts:
             self.schedule = Uncertainty(self.model, p, self.state_sizes)
             if self.levant:
@@ -167,11 +164,11 @@ class ObserverConfiguration:
                     f"parameters '{name}', 'unknown_input': {name} = {p[name]} needs levels of "
                     'the unknown input, expected unknown_input = true, got false'
                 )
-        first, second = SCHEMES[p['structure']]
-        if not self.self_tuning and p['scheme'] not in (first, second):
+        cascade = p['structure'] == 'cascade' and not self.self_tuning
+        if cascade and p['scheme'] == 'predict_correct':
             raise ConfigurationError(
-                f"parameters 'scheme', 'structure': expected scheme = {first!r} or {second!r} "
-                f'with {p["structure"]}, got {p["scheme"]!r}'
+                "parameters 'scheme', 'structure': expected scheme = 'explicit' or 'implicit' "
+                "with cascade, got 'predict_correct'"
             )
 
     def _per_level(self, name: str) -> Floats:

@@ -30,7 +30,7 @@ DOUBLINGS = 60
 # Parameters that decide whether there is a steady covariance.
 DECIDING = (
     'noise_size', 'unknown_input_size', 'unknown_input_rate', 'unknown_input_decay',
-    'correction_period', 'structure', 'scheme', 'phi',
+    'correction_period', 'structure', 'phi',
 )
 
 

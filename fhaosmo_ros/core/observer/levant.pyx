@@ -6,7 +6,7 @@ One innovation drives every level: eps = y - z_hat_1; gamma is held. Equations a
 numbers in docs/mathematics.md (D). The internal states mirror the estimates, z_tilde_{i+1} =
 z_hat_{i+1}, so that whatever reads a cascade's state reads this one; theta is 0.
 
-With `noise_size` the gains of predict_correct are scheduled: the covariance P of the errors
+With `noise_size` the gains are scheduled: the covariance P of the errors
 follows the Kalman filter of the model, linearised at rest, with a Matern model of d (D 17, D 20).
 It begins with the sizes of the states, of d and of the noise that parameters tell, and makes gains
 larger until it is steady. It also says which samples are unlikely (D 21).
@@ -17,7 +17,7 @@ Levant 2003, doi:10.1080/0020717031000099029.
 from libc.math cimport INFINITY, M_2_PI, copysign, erfc, exp, fabs, log, log1p, pow, sqrt
 from libc.string cimport memcpy
 
-from fhaosmo_ros.core.model.phi cimport Dual, evaluate
+from fhaosmo_ros.core.model.phi cimport Dual
 from fhaosmo_ros.core.model.prediction cimport MOST_LEVELS
 from fhaosmo_ros.core.observer.kalman cimport Row, fill
 from fhaosmo_ros.core.observer.sliding_mode cimport (
@@ -27,7 +27,6 @@ from fhaosmo_ros.core.observer.sliding_mode cimport (
 from fhaosmo_ros.core.observer.structure cimport Memory
 
 from fhaosmo_ros.core.observer.configuration import deadbeat_shares
-import numpy as np
 
 # An interval that differs from the tuned one by at most this part of it needs no other gains.
 cdef double NEAR = 0.25
@@ -66,7 +65,7 @@ cdef class Levant(SlidingMode):
 
     cdef double widest  # half-width (unit of y); growth begins beyond it (D 22)
     cdef double relaxation  # at which the scale returns to 1 (1/s)
-    cdef const double[:, ::1] share  # beta of D 18; 1 for implicit
+    cdef const double[:, ::1] share  # beta of D 18
     cdef double ratio[MOST_LEVELS]  # factors of the corrections of the levels, P / steady P
     cdef double correction_period  # interval that the gains are tuned for (s); 0: any
     # For scheduled gains (D 20).
@@ -79,11 +78,11 @@ cdef class Levant(SlidingMode):
         cdef int i, n = self.levels
         self.widest = INFINITY
         # With larger powers saturated levels find y again by themselves.
-        if self.predicting and not self.is_sign and self.gamma_initial < 0.5:
+        if not self.is_sign and self.gamma_initial < 0.5:
             self.widest = max(configuration.widths)
             speed = (configuration.lambdas[n - 1] / configuration.widths[n - 1]) ** (1.0 / n)
             self.relaxation = speed / 3.0
-        self.share = deadbeat_shares(n) if self.predicting else np.ones((n, n))
+        self.share = deadbeat_shares(n)
         for i in range(n):
             self.ratio[i] = 1.0
         self.correction_period = configuration.parameters['correction_period']
@@ -102,32 +101,7 @@ cdef class Levant(SlidingMode):
         memory.scale = 1.0
 
     cdef void follow(self, double y, double h, const double* u) noexcept nogil:
-        """Advance `trial` by the scheme."""
-        if self.predicting:
-            self.predict_correct(y, h, u)
-        else:
-            self.backward(y, h, u)
-
-    cdef void backward(self, double y, double h, const double* u) noexcept nogil:
-        """
-        Backward Euler of D 11, one scalar equation for all levels (D 12).
-
-        Phi is taken at the new sample `y`, at the interval's end, and the old estimates.
-        """
-        cdef double m[MOST_LEVELS]
-        cdef double still[MOST_LEVELS]
-        cdef double above = 0.0, phi
-        cdef int i, n = self.levels
-        for i in range(n):
-            m[i], still[i] = y if i == 0 else self.trial[i].z_hat, 0.0
-        for i in range(n - 1, -1, -1):
-            phi = evaluate(self.prediction.phi, i, m, still, u).value
-            above = self.trial[i].z_hat + h * (above + phi)
-            self.trial[i].z_hat = above
-        self.correct_levels(y, h)
-
-    cdef void predict_correct(self, double y, double h, const double* u) noexcept nogil:
-        """Follow the model to the sample `y`, then correct (D 18)."""
+        """Follow the model to the sample `y`, then correct `trial` (D 18)."""
         cdef Memory* memory = &self.memory
         cdef Row* p = self.trial_covariance
         cdef int i, n = self.levels
@@ -173,7 +147,7 @@ cdef class Levant(SlidingMode):
         self.correct_levels(y, period)
 
     cdef void correct_levels(self, double y, double h) noexcept nogil:
-        """Turn predicted levels into corrected ones by the solution of D 12 or D 18."""
+        """Turn predicted levels into corrected ones by the solution of D 18."""
         cdef double weight[MOST_LEVELS]  # h^i lambda_i
         cdef double power_of_h[MOST_LEVELS]  # h^i
         cdef double scale = self.memory.scale, power = 1.0, v, share
@@ -203,7 +177,7 @@ cdef class Levant(SlidingMode):
 
     cdef Root root(self, const double* weight, double b, double gamma) noexcept nogil:
         """
-        Solve eps + sum_i h^i lambda_i |eps|^{p_i} s_i = b, s_i in psi_i(eps), b >= 0 (D 12).
+        Solve eps + sum_i h^i lambda_i |eps|^{p_i} s_i = b, s_i in psi_i(eps), b >= 0 (D 18).
 
         Newton's method on the logarithms of both sides over that of eps: there a sum of powers is
         convex and nearly straight, at any gamma and over any range. Powers are those of w, as

@@ -138,10 +138,9 @@ class Observer:
             return 'self-tuning: a bank of Kalman filters'
         structure = 'Levant' if c.levant else 'super-twisting cascade'
         power = 'adaptive power' if c.adaptive and c.parameters['gamma_rate'] > 0.0 else 'power'
-        return (
-            f'{structure}, {"sign" if c.is_sign else "fuzzy"}, '
-            f'{power} {c.gamma_initial:g}, {c.parameters["scheme"]}'
-        )
+        scheme = 'predict_correct' if c.levant else c.parameters['scheme']
+        curve = 'sign' if c.is_sign else 'fuzzy'
+        return f'{structure}, {curve}, {power} {c.gamma_initial:g}, {scheme}'
 
     @property
     def model(self) -> TriangularModel:

@@ -85,7 +85,6 @@ class OnlineEstimator:
         if p['smoothing_lag'] > 0.0:
             _check_smoothing(p, self.observer.configuration)
             self.smoothing = Smoother(self.observer, round(p['smoothing_lag'] / NANOSECONDS))
-        self._u = np.zeros(len(self.observer.inputs))
         self.policy = Policy(self.observer.structure, self._settings(p))
         self.events = EventDetector(p)
 
@@ -122,14 +121,7 @@ class OnlineEstimator:
         """
         if self.smoothing is not None:
             return self.smoothing.stamp if self.smoothing.estimate else None
-        course = self.policy.course
-        return course['stamp'] - self._behind if course['valid'] else None
-
-    @property
-    def _behind(self) -> int:
-        """How long before the stamp of its sample an estimate belongs, in nanoseconds."""
-        p = self._parameters
-        return 0 if p['predict_to_now'] else round(p['measurement_delay'] / NANOSECONDS)
+        return self.policy.stamp  # type: ignore[no-any-return]
 
     @property
     def period(self) -> float:
@@ -276,8 +268,10 @@ class OnlineEstimator:
         """What is remembered of the known inputs."""
         policy = self.policy
         return {
-            'u': self._u, 'past_latest': policy.latest_inputs, 'past_pieces': policy.pieces,
-        }  # fmt: skip
+            'u': policy.held_inputs,
+            'past_latest': policy.latest_inputs,
+            'past_pieces': policy.pieces,
+        }
 
     def _cut(self) -> None:
         """Smooth nothing across what has happened."""
@@ -296,7 +290,7 @@ class OnlineEstimator:
     @property
     def inputs(self) -> tuple[float, ...]:
         """The known inputs that are held, in the order of `Observer.inputs`."""
-        return tuple(self._u.tolist())
+        return tuple(self.policy.held_inputs.tolist())
 
     def set_input(self, u: float, index: int = 0) -> bool:
         """
@@ -317,7 +311,7 @@ class OnlineEstimator:
         if not math.isfinite(u):
             self.reject_inputs(1)
             return False
-        self._u[index] = u
+        self.policy.held_inputs[index] = u
         return True
 
     def reject_inputs(self, count: int) -> None:
@@ -348,15 +342,15 @@ class OnlineEstimator:
             A stamp that is no integer: seconds are not nanoseconds.
 
         """
-        self.advance(operator.index(stamp), y)
+        self.advance(min(max(operator.index(stamp), -LARGEST_STAMP), LARGEST_STAMP), y)
         return self.policy.report() if self.smoothing is None else self.estimate
 
     def advance(self, stamp: int, y: float) -> int:
-        """Do what `update` does and return only the status word; see `estimate`."""
-        stamp = min(max(stamp, -LARGEST_STAMP), LARGEST_STAMP)
+        """Do what `update` does, of a stamp of 64 bits, and return only the status word."""
         if self.smoothing is None and not self.events.on:
-            return self.policy.advance(stamp, y, self._u)  # type: ignore[no-any-return]
-        self._run(np.array([stamp]), np.array([y], dtype=np.float64), self._u[np.newaxis])
+            return self.policy.advance(stamp, y)  # type: ignore[no-any-return]
+        held = self.policy.held_inputs[np.newaxis]
+        self._run(np.array([stamp]), np.array([y], dtype=np.float64), held)
         return self.observer.structure.word  # type: ignore[no-any-return]
 
     def run(self, stamps: ArrayLike, y: ArrayLike, u: ArrayLike | None = None) -> Trajectory:
@@ -393,20 +387,21 @@ class OnlineEstimator:
                 f'run: expected stamps in nanoseconds, which are integers, got {stamps.dtype}'
             )
         stamps, count = stamps.astype(np.int64, copy=False), len(y)
-        inputs = np.tile(self._u, (count, 1))
+        held = self.policy.held_inputs
+        inputs = np.tile(held, (count, 1))
         if u is not None:
             inputs = known_inputs(u, self.observer.inputs, count)
             for k, j in np.argwhere(~np.isfinite(inputs)):
-                inputs[k, j] = inputs[k - 1, j] if k else self._u[j]
+                inputs[k, j] = inputs[k - 1, j] if k else held[j]
                 self.reject_inputs(1)
         if count:
-            self._u[:] = inputs[-1]
+            held[:] = inputs[-1]
         return self._run(stamps, y, inputs)
 
     def _run(self, stamps: Ints, y: NDArray[np.float64], u: NDArray[np.float64]) -> Trajectory:
         """Take samples with their known inputs, and look at them for events and for smoothing."""
         record, present, times, acting = self.policy.run(stamps, y, u)
-        found = Trajectory(stamps - self._behind, **record.columns)
+        found = Trajectory(stamps - self.policy.behind, **record.columns)
         if self.events.on:
             deviations = found.standard_deviation[:, -1] if self.observer.self_tuning else None
             self.events.take(found.t, found.unknown_input, deviations, times, found.status)
@@ -426,7 +421,7 @@ class OnlineEstimator:
         """
         if self.smoothing is not None:
             return self.smoothing.estimate
-        return self.policy.report() if self.policy.course['valid'] else None
+        return None if self.policy.stamp is None else self.policy.report()
 
     @property
     def standard_deviation(self) -> NDArray[np.float64]:

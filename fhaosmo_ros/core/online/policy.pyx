@@ -130,6 +130,8 @@ cdef class Policy:
     cdef Clock clock
     cdef Sensor sensor
     # The known inputs of late.
+    cdef readonly object held_inputs  # (m,) array: for the next sample
+    cdef double* held  # its numbers
     cdef readonly object latest_inputs  # (m,) array: at the latest sample that was used
     cdef double* present  # its numbers
     cdef double acting[MOST_INPUTS]  # a mean: in the latest step, where y is known later
@@ -138,8 +140,9 @@ cdef class Policy:
 
     def __cinit__(self, Structure structure not None, dict settings):
         cdef bint late = settings['lag'] > 0
-        cdef double[::1] latest = np.zeros(structure.inputs)
+        cdef double[::1] held = np.zeros(structure.inputs), latest = held.copy()
         cdef double[:, ::1] pieces = np.zeros((MOST_PIECES * late, 1 + structure.inputs))
+        self.held_inputs, self.held = np.asarray(held), &held[0]
         self.latest_inputs, self.present = np.asarray(latest), &latest[0]
         self.pieces = np.asarray(pieces)
         if late:
@@ -646,16 +649,10 @@ cdef class Policy:
 
     # What Python calls
 
-    def advance(self, long long stamp, double y, const double[::1] u):
-        """Take a sample with its known inputs, all finite; return the status word."""
-        self.check(u.shape[0])
-        return self.take(stamp, y, &u[0])
-
-    cdef void check(self, Py_ssize_t inputs) except *:
-        """Raise where another thread runs this, or where there are other known inputs."""
+    def advance(self, long long stamp, double y):
+        """Take a sample with the known inputs that are held; return the status word."""
         self.structure.enter()
-        if inputs != self.structure.inputs:
-            raise ValueError(f'expected {self.structure.inputs} known inputs, got {inputs}')
+        return self.take(stamp, y, self.held)
 
     def run(self, const long long[::1] stamps, const double[::1] y, const double[:, ::1] u):
         """
@@ -672,8 +669,8 @@ cdef class Policy:
         cdef long long[::1] times = np.empty(count, dtype=np.int64)
         cdef double[:, ::1] acting = np.empty((count, m))
         cdef const double* inputs
-        self.check(u.shape[1])
-        if not stamps.shape[0] == u.shape[0] == count:
+        structure.enter()
+        if not (stamps.shape[0] == u.shape[0] == count and u.shape[1] == m):
             raise ValueError('run: arrays of different lengths')
         structure.busy = True
         try:
@@ -690,6 +687,16 @@ cdef class Policy:
         finally:
             structure.busy = False
         return record, np.asarray(present), np.asarray(times), np.asarray(acting)
+
+    @property
+    def behind(self):
+        """How long before the stamp of its sample an estimate belongs (ns)."""
+        return 0 if self.settings.to_now else self.settings.delay
+
+    @property
+    def stamp(self):
+        """Time of the latest estimate (ns); None while there is none."""
+        return self.course.stamp - self.behind if self.course.valid else None
 
     def report(self):
         """Return the latest estimate as it is published, with the status of the last sample."""
@@ -723,9 +730,10 @@ cdef class Policy:
         self.course, self.clock, self.sensor = memory, memory, memory
 
     def __reduce__(self):
-        state = self.memory, self.counters, self.latest_inputs, self.pieces
+        state = self.memory, self.counters, self.held_inputs, self.latest_inputs, self.pieces
         return Policy, (self.structure, self.settings), state
 
     def __setstate__(self, state):
-        memory, self.counters, self.latest_inputs[:], self.pieces[:] = state
+        memory, self.counters, *arrays = state
+        self.held_inputs[:], self.latest_inputs[:], self.pieces[:] = arrays
         self.change(**memory)

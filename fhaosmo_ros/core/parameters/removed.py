@@ -2,7 +2,7 @@
 """Parameters of older versions: what stands for each of them now."""
 
 REMOVED = {
-    'fuzzy_growth': "leave it out: 'predict_correct' has it wherever 'gamma_initial' is below 0.5",
+    'fuzzy_growth': "leave it out: 'levant' has it wherever 'gamma_initial' is below 0.5",
     'fuzzy_shape': "name the shape in 'fuzzy_systems', such as 'terms gaussian 5'",
     'fuzzy_normalise': "leave it out: psi always ends at +-1; scale 'lambda' and 'alpha' instead",
     'gamma_leakage_delay': "leave it out: 'gamma_leakage' acts within the dead zone",

@@ -61,23 +61,23 @@ OBSERVER = (
               'sign_adaptive, fuzzy_adaptive: gamma adapts; with levant it stays gamma_initial.',
               choices=('sign', 'fuzzy', 'fuzzy_adaptive', 'sign_adaptive')),
     Parameter('scheme', 'implicit',
-              'explicit (cascade only): forward Euler, as in the paper. implicit: backward '
-              'Euler, without the chatter of the time step. predict_correct (levant only): '
-              'Runge-Kutta steps to the new sample, then a correction as in implicit.',
+              'Of cascade. explicit: forward Euler, as in the paper. implicit: backward Euler, '
+              'without the chatter of the time step. levant always predicts by Runge-Kutta steps '
+              'to the new sample and then corrects: predict_correct.',
               choices=('explicit', 'implicit', 'predict_correct')),
     Parameter('prediction_step', 0.0,
-              'Longest Runge-Kutta step of predict_correct and of self_tuning. Well below 1 / '
+              'Longest Runge-Kutta step of levant and of self_tuning. Well below 1 / '
               "rate of the model's fastest motion; 0: a tenth of that at z = 0.", unit='s',
               lower=0.0, upper=1e12),
     Parameter('correction_period', 0.0,
-              'predict_correct: a sample corrects as if it stood for at most this time, usually '
+              'levant: a sample corrects as if it stood for at most this time, usually '
               'the sampling period, however long the gap before it. 0: for all the time since '
               'the one before.', unit='s', lower=0.0, upper=10.0),
     Parameter('noise_size', 0.0,
-              'Standard deviation of the noise on y; 0: not known. With it cascade, or '
-              'predict_correct with correction_period, starts as a Kalman filter does; '
-              'predict_correct then also follows other rates, rejects unlikely samples, and '
-              'notices that y is lost.', lower=0.0, upper=1e12),
+              'Standard deviation of the noise on y; 0: not known. With it cascade, or levant '
+              'with correction_period, starts as a Kalman filter does; levant then also follows '
+              'other rates, rejects unlikely samples, and notices that y is lost.', lower=0.0,
+              upper=1e12),
     Parameter('state_sizes', [0.0],
               'RMS of z_1 .. z_n in usual operation: how far off a fresh observer may be. Used '
               'with noise_size. 0: what size and rate of d make of them.', lower=0.0, upper=1e100,

@@ -143,11 +143,14 @@ class Channel:
         if not self._active:
             return
         health = self._health
-        health.delays.append(time_ns() - source)
+        health.delay = max(health.delay, time_ns() - source)
         health.offset = source - stamp if stamp else 0
         measured = stamp
         if self.values['sampling'] == 'clock':
             stamp = self._clock.now().nanoseconds
+        if not self.pairing.by_stamp:
+            self._take(stamp, y)
+            return
         self.pairing.take_sample(measured, (stamp, y))
         self._waits_since = perf_counter()
         self._take_paired()
@@ -161,23 +164,20 @@ class Channel:
 
     def _take(self, stamp: int, y: float) -> None:
         """Step the observer to a sample."""
-        begin, estimator, health = perf_counter(), self.estimator, self._health
+        estimator, begin = self.estimator, perf_counter()
         word = estimator.advance(stamp, y)
         now = perf_counter()
-        health.durations.append(now - begin)
-        used = not word & UNUSED
-        if used:
-            self._arrived = True
-            self._outputs.sample_used(stamp)
-            health.latest = now
-            health.stamps.append(stamp)
-            health.unknown_inputs.append(estimator.observer.estimate.unknown_input)
         if word & (REJECTED | NEWS):
             self._tell(word, stamp, y)
         if estimator.events.waiting:
             self._tell_events()
-        if used and self.values['publish_on'] == 'sample':
-            self._publish()
+        if not word & UNUSED:
+            health, self._arrived = self._health, True
+            health.latest = now
+            health.samples.append((stamp, now - begin, estimator.policy.structure.unknown_input))
+            self._outputs.sample_used(stamp, now)
+            if self.values['publish_on'] == 'sample':
+                self._publish()
 
     def _tell_events(self) -> None:
         """Publish, and log, the events that have begun or ended."""
@@ -224,11 +224,10 @@ class Channel:
                 self._logger.warning(text)
 
     def _on_input(self, index: int, name: str, stamp: int, u: float, _: int) -> None:
-        if isfinite(u):
+        if self.pairing.by_stamp and isfinite(u):
             self.pairing.take_input(index, stamp, u)
             self._take_paired()
-        else:
-            self.estimator.reject_inputs(1)
+        elif not self.estimator.set_input(u, index):
             self._logger.warning(
                 f'rejected {name} = {u}: expected a finite number; the last one is held',
                 throttle_duration_sec=QUIET,
@@ -239,12 +238,13 @@ class Channel:
         estimate, stamp = self.estimator.estimate, self.estimator.stamp
         if estimate is not None:
             self._outputs.publish(estimate, stamp)
-            joint = self.y.field.key if self.y.field else ''
-            self._typed.add(Output(self.name or joint or 'y', stamp, estimate, self.values))
+            name = self.name or (self.y.field and self.y.field.key) or 'y'
+            self._typed.add(Output(name, stamp, estimate, self.values))
 
     def tick(self) -> None:
         """Publish at the node's rate, if it is to; log once that y is silent."""
-        if perf_counter() - self._waits_since > self.values['known_input_wait']:
+        waited = perf_counter() - self._waits_since
+        if self.pairing.by_stamp and waited > self.values['known_input_wait']:
             self._take_paired(at_once=True)  # samples may wait for inputs, and no sample follows
         if self._arrived:
             self._arrived = self._stale = False

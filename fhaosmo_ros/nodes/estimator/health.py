@@ -3,7 +3,7 @@
 
 from collections import deque
 from collections.abc import Mapping
-from math import nan
+from math import inf, nan
 from time import perf_counter
 from typing import Any
 
@@ -50,18 +50,16 @@ class Health:
     """
     Remembers a few numbers of each sample of a `Channel`, and makes two reports of them.
 
-    Appended to on each sample: `stamps` (ns), `delays` from the source stamp to the callback (ns),
-    `durations` of the callback (s), `unknown_inputs`. `latest` is the time of the last sample on
-    `perf_counter`, `offset` from its stamp to the publication of its message (ns).
+    `samples` has the stamp (ns), the time of the step (s) and d of each sample that was used.
+    `latest` is the time of the last one on `perf_counter`. `delay` is the longest time from the
+    publication of a sample to its callback, and `offset` that from its stamp to its publication
+    (ns).
     """
 
     def __init__(self, channel: Any) -> None:
         self._channel = channel
-        self.stamps: deque[int] = deque(maxlen=LIMIT)
-        self.delays: deque[int] = deque(maxlen=LIMIT)
-        self.durations: deque[float] = deque(maxlen=LIMIT)
-        self.unknown_inputs: deque[float] = deque(maxlen=LIMIT)
-        self.offset = 0
+        self.samples: deque[tuple[int, float, float]] = deque(maxlen=LIMIT)
+        self.delay, self.offset = -inf, 0
         self.latest = nan
         self._before = self._counts()
         self._events_before = 0
@@ -76,14 +74,15 @@ class Health:
         counts = self._counts()
         news = {key: count - self._before[key] for key, count in counts.items()}
         self._before = counts
-        periods = np.diff(np.array(self.stamps, dtype=np.int64)) * NANOSECONDS
+        stamps, durations, d = zip(*self.samples, strict=True) if self.samples else ((), (), ())
+        periods = np.diff(np.array(stamps, dtype=np.int64)) * NANOSECONDS
         mean = float(np.mean(periods)) if len(periods) else nan
         title = f'{self._channel.name} '.lstrip()
         reports = [Report(f'{title}input'), Report(f'{title}observer')]
         self._input(reports[0], periods, mean, news, stale)
-        self._observer(reports[1], mean, news, stale)
-        for column in (self.stamps, self.delays, self.durations, self.unknown_inputs):
-            column.clear()
+        self._observer(reports[1], mean, np.array(durations), np.array(d), news, stale)
+        self.samples.clear()
+        self.delay = -inf
         return reports
 
     def _input(
@@ -99,7 +98,7 @@ class Health:
         source, heard = y.source, y.source.heard
         rate = 1.0 / mean if mean > 0.0 else nan
         jitter = float(np.std(periods)) * rate if len(periods) else nan
-        delay = max(self.delays) * NANOSECONDS if self.delays else nan
+        delay = self.delay * NANOSECONDS if self.delay > -inf else nan
         offset = self.offset * NANOSECONDS
         age = perf_counter() - self.latest
         stamps = 'clock' if limits['sampling'] == 'clock' else y.stamps
@@ -162,13 +161,20 @@ class Health:
         for key, text in UNPAIRED.items():
             report.find(WARN, f'{news[key]} {key}{text}', news[key])
 
-    def _observer(self, report: Report, mean: float, news: Mapping[str, int], stale: bool) -> None:
+    def _observer(
+        self,
+        report: Report,
+        mean: float,
+        durations: NDArray[np.float64],
+        d: NDArray[np.float64],
+        news: Mapping[str, int],
+        stale: bool,
+    ) -> None:
         estimator, limits = self._channel.estimator, self._channel.values
         observer, estimate, offset = estimator.observer, estimator.estimate, estimator.offset
         unit = derivative_unit(limits['measurement_unit'], observer.order)
         d_now = estimate.unknown_input if estimate else nan
         spread = observer.structure.memory['spread']
-        d, durations = np.array(self.unknown_inputs), np.array(self.durations)
         chatter = high_passed(d, WINDOW)
         deviation = float(np.std(d)) if len(d) else nan
         overruns = int(np.sum(durations > mean))
@@ -188,7 +194,7 @@ class Health:
                 min(1.0, chatter / deviation) if deviation > 0.0 else 0.0
             ),
             'step time, mean [us]': 1e6 * float(np.mean(durations)) if len(durations) else 0.0,
-            'step time, longest [us]': 1e6 * max(self.durations, default=0.0),
+            'step time, longest [us]': 1e6 * np.max(durations, initial=0.0),
             'overruns': overruns,
         }
         if observer.self_tuning:
@@ -214,7 +220,7 @@ class Health:
         moved = f'gamma is {away:+.2g} away from gamma_initial'
         report.find(WARN, moved, abs(away) > GAMMA_AWAY)
         tuned = observer.parameters['correction_period']
-        if tuned and mean > 0.0 and observer.parameters['scheme'] == 'predict_correct':
+        if tuned and mean > 0.0 and observer.configuration.levant:
             rates = f'gains are for {1.0 / tuned:.4g} Hz, y comes at {1.0 / mean:.4g} Hz'
             report.find(WARN, rates, not tuned / RATE_RATIO < mean < tuned * RATE_RATIO)
         wide = f'innovations are {spread:.3g} times as large as noise_size says'

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """What channels publish, alone and together, and the text with the parameters of their node."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from math import nan
-from time import monotonic
+from time import perf_counter
 from typing import Any, NamedTuple
 
 from fhaosmo_ros.core.model.triangular import TriangularModel
@@ -39,14 +39,22 @@ class Outputs:
     def __init__(self, node: Node, prefix: str, estimator: OnlineEstimator) -> None:
         observer = estimator.observer
         self._estimator = estimator
-        self._publishers = {
-            name: create_publisher(node, message_class(kind), prefix + name)
-            for name, kind in estimates_of(observer.parameters).items()
-        }
         states = [f'z{i + 1}' for i in range(observer.order)]
-        self._state, self._tuning = labelled(states), labelled(TUNING)
-        self._deviation = labelled([*states, 'd'])
-        self._innovation = labelled([f'eps{i + 1}' for i in range(observer.levels)])
+        state, deviation, tuning = labelled(states), labelled([*states, 'd']), labelled(TUNING)
+        innovation = labelled([f'eps{i + 1}' for i in range(observer.levels)])
+        make: dict[str, Callable[[Estimate, int], Any]] = {
+            'gamma': lambda estimate, _: Float64(data=estimate.gamma),
+            STANDARD_DEVIATION: lambda *_: deviation(estimator.standard_deviation),
+            'tuning': lambda *_: tuning(np.hstack(estimator.tuning)),
+            'state': lambda estimate, _: state(estimate.z),
+            'unknown_input': lambda estimate, _: Float64(data=estimate.unknown_input),
+            'innovation': lambda estimate, _: innovation(estimate.innovation),
+            'stamp': lambda _, stamp: time_message(stamp),
+        }
+        self._publishers = [
+            (create_publisher(node, message_class(kind), prefix + name), make[name])
+            for name, kind in estimates_of(observer.parameters).items()
+        ]
         self._period = PERIOD_OF_SELF_TUNING if observer.self_tuning else PERIOD
         self._first, self._published = True, 0.0
         self._labels: list[str] = []
@@ -54,23 +62,13 @@ class Outputs:
 
     def publish(self, estimate: Estimate, stamp: int) -> None:
         """Publish an estimate and, last, the stamp of its sample in nanoseconds."""
-        estimator = self._estimator
-        messages = {
-            'gamma': lambda: Float64(data=estimate.gamma),
-            STANDARD_DEVIATION: lambda: self._deviation(estimator.standard_deviation),
-            'tuning': lambda: self._tuning(np.hstack(estimator.tuning)),
-            'state': lambda: self._state(estimate.z),
-            'unknown_input': lambda: Float64(data=estimate.unknown_input),
-            'innovation': lambda: self._innovation(estimate.innovation),
-            'stamp': lambda: time_message(stamp),
-        }
-        for name, publisher in self._publishers.items():
+        for publisher, make in self._publishers:
             if has_listeners(publisher):
-                publisher.publish(messages[name]())
+                publisher.publish(make(estimate, stamp))
 
-    def sample_used(self, stamp: int) -> None:
-        """Publish a snapshot after the first sample, and if it is time to."""
-        if self._first or monotonic() - self._published >= self._period:
+    def sample_used(self, stamp: int, now: float) -> None:
+        """Publish a snapshot after the first sample, and if it is time to, by perf_counter."""
+        if self._first or now - self._published >= self._period:
             # Where samples wait in a queue, the observer may be ahead of this one.
             begins = self._first and stamp == self._estimator.latest
             self.snapshot(Flag.STARTED if begins else Flag(0))
@@ -83,7 +81,7 @@ class Outputs:
             if labels != self._labels:  # a state before a gap is there only after one
                 self._labels, self._message = labels, labelled(labels)
             self._snapshots.publish(self._message(vector))
-            self._first, self._published = flags == Flag.RESET, monotonic()
+            self._first, self._published = flags == Flag.RESET, perf_counter()
 
 
 class Output(NamedTuple):

@@ -44,8 +44,8 @@ def create_publisher(node: Node, kind: Any, topic: str, latched: bool = False) -
 
 def has_listeners(publisher: Any) -> bool:
     """Return whether anybody listens; to a latched topic always those who come later."""
-    latched = publisher.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
-    return bool(latched or publisher.get_subscription_count())
+    latched = DurabilityPolicy.TRANSIENT_LOCAL
+    return bool(publisher.get_subscription_count() or publisher.qos_profile.durability == latched)
 
 
 def full_name(node: Node, topic: str) -> str:

@@ -105,10 +105,9 @@ def _identify(
     """Find the gains for what y itself shows."""
     if others := chosen_otherwise(estimator):
         raise ConfigurationError(
-            f'--bag: expected gains of structure levant and scheme '
-            f'predict_correct, got {", ".join(others)} set. Leave that out; or tune by a '
-            'simulated family: without --bag, with noise_std, rms_of_d and band_of_d as this '
-            'command finds them'
+            f'--bag: expected gains of structure levant, got {", ".join(others)} set. Leave that '
+            'out; or tune by a simulated family: without --bag, with noise_std, rms_of_d and '
+            'band_of_d as this command finds them'
         )
     given = ParameterTable(MODEL).part_of(tuning) | estimator
     values = ESTIMATOR_PARAMETERS.complete(given)
