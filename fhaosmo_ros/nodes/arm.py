@@ -25,8 +25,8 @@ from fhaosmo_ros.nodes.middleware.diagnostics import (
 from fhaosmo_ros.nodes.middleware.endpoints import (
     check_overrides,
     create_publisher,
-    has_listeners,
     LATCHED,
+    Listeners,
     SENSOR_QOS,
 )
 from fhaosmo_ros.nodes.middleware.messages import time_message
@@ -105,6 +105,7 @@ class ArmNode(TimedNode):
             for topic, kind in TOPICS.items()
             if topic != 'external_wrench' or values['wrench_frame']
         }
+        self._listeners = Listeners(self._outputs)
         NodeParameters(self, values, self._prepare, self._adopt)
         if values['robot_description_file']:
             self._use(text_of(values, 'robot_description_file', 'a URDF'))
@@ -176,23 +177,22 @@ class ArmNode(TimedNode):
         if 0.0 <= estimate.stamp - self._published < 0.9 * period:
             return
         self._published = estimate.stamp
-        stamp = time_message(estimate.stamp)
-        for topic, fields in FIELDS.items():
-            if has_listeners(self._outputs[topic]):
-                message = self._messages[topic]
+        stamp, heard = time_message(estimate.stamp), self._listeners.heard()
+        for topic, message in self._messages.items():
+            if topic in heard:
                 message.header.stamp = stamp
-                for field, of_estimate in fields.items():
+                for field, of_estimate in FIELDS[topic].items():
                     setattr(message, field, getattr(estimate, of_estimate).tolist())
-                self._outputs[topic].publish(message)
-        frame = self._values['wrench_frame']
-        if frame and has_listeners(self._outputs['external_wrench']):
+                heard[topic].publish(message)
+        if publisher := heard.get('external_wrench'):
+            frame = self._values['wrench_frame']
             wrench, message = arm.wrench(estimate, frame), WrenchStamped()
             self._near = wrench.near_singular
             message.header.stamp, message.header.frame_id = stamp, frame
             message.wrench.force, message.wrench.torque = (
                 Vector3(x=x, y=y, z=z) for x, y, z in (wrench.force, wrench.torque)
             )
-            self._outputs['external_wrench'].publish(message)
+            publisher.publish(message)
 
     def _tell(self, arm: Arm, estimate: ArmEstimate) -> None:
         """Publish that a contact has begun or ended."""

@@ -238,7 +238,7 @@ class Channel:
         estimate, stamp = self.estimator.estimate, self.estimator.stamp
         if estimate is not None:
             self._outputs.publish(estimate, stamp)
-            name = self.name or (self.y.field and self.y.field.key) or 'y'
+            name = self.name or self.y.element or 'y'
             self._typed.add(Output(name, stamp, estimate, self.values))
 
     def tick(self) -> None:

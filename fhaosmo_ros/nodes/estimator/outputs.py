@@ -15,7 +15,7 @@ from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.files import dumps
 from fhaosmo_ros.core.parameters.per_channel import CHANNELS, differing, of_channel
 from fhaosmo_ros.inputs import Input, known_inputs, measured_output
-from fhaosmo_ros.nodes.middleware.endpoints import create_publisher, DEPTH, has_listeners, LATCHED
+from fhaosmo_ros.nodes.middleware.endpoints import create_publisher, DEPTH, LATCHED, Listeners
 from fhaosmo_ros.nodes.middleware.messages import labelled, message_class, time_message
 from fhaosmo_ros.topics import ARRAY, estimates_of, SNAPSHOT, STANDARD_DEVIATION, TYPED_ESTIMATES
 from geometry_msgs.msg import AccelStamped, WrenchStamped
@@ -33,7 +33,7 @@ class Outputs:
     Publishers of one channel's estimates and of its snapshots, by which a replay follows it.
 
     Those of the estimates have ROS' parameters qos_overrides./TOPIC.publisher.POLICY. What nobody
-    listens to is not made: a message costs as much as a step with fixed gains.
+    listens to is not made: a message costs more than a step with fixed gains.
     """
 
     def __init__(self, node: Node, prefix: str, estimator: OnlineEstimator) -> None:
@@ -42,7 +42,7 @@ class Outputs:
         states = [f'z{i + 1}' for i in range(observer.order)]
         state, deviation, tuning = labelled(states), labelled([*states, 'd']), labelled(TUNING)
         innovation = labelled([f'eps{i + 1}' for i in range(observer.levels)])
-        make: dict[str, Callable[[Estimate, int], Any]] = {
+        self._make: dict[str, Callable[[Estimate, int], Any]] = {
             'gamma': lambda estimate, _: Float64(data=estimate.gamma),
             STANDARD_DEVIATION: lambda *_: deviation(estimator.standard_deviation),
             'tuning': lambda *_: tuning(np.hstack(estimator.tuning)),
@@ -51,10 +51,10 @@ class Outputs:
             'innovation': lambda estimate, _: innovation(estimate.innovation),
             'stamp': lambda _, stamp: time_message(stamp),
         }
-        self._publishers = [
-            (create_publisher(node, message_class(kind), prefix + name), make[name])
+        self._listeners = Listeners({
+            name: create_publisher(node, message_class(kind), prefix + name)
             for name, kind in estimates_of(observer.parameters).items()
-        ]
+        })  # fmt: skip
         self._period = PERIOD_OF_SELF_TUNING if observer.self_tuning else PERIOD
         self._first, self._published = True, 0.0
         self._labels: list[str] = []
@@ -62,9 +62,8 @@ class Outputs:
 
     def publish(self, estimate: Estimate, stamp: int) -> None:
         """Publish an estimate and, last, the stamp of its sample in nanoseconds."""
-        for publisher, make in self._publishers:
-            if has_listeners(publisher):
-                publisher.publish(make(estimate, stamp))
+        for name, publisher in self._listeners.heard().items():
+            publisher.publish(self._make[name](estimate, stamp))
 
     def sample_used(self, stamp: int, now: float) -> None:
         """Publish a snapshot after the first sample, and if it is time to, by perf_counter."""
@@ -104,11 +103,11 @@ class TypedOutputs:
     def __init__(self, node: Node, values: Mapping[str, Any]) -> None:
         self._frame: str = values['frame_id']
         self._waiting: dict[str, Output] = {}
-        self._publishers = {
+        self._listeners = Listeners({
             name: node.create_publisher(message_class(TYPED_ESTIMATES[name]), f'~/{name}', DEPTH)
             for name in dict.fromkeys(values['typed_outputs'])
             if name != 'none'
-        }
+        })  # fmt: skip
 
     def add(self, output: Output) -> None:
         """Let an estimate wait for those of other channels."""
@@ -118,13 +117,14 @@ class TypedOutputs:
 
     def publish(self) -> None:
         """Publish the estimates that wait, with the latest of their stamps."""
+        if not self._waiting:
+            return
         outputs = list(self._waiting.values())
-        for name, publisher in self._publishers.items() if outputs else ():
-            if has_listeners(publisher):
-                message = MAKERS[name](outputs)
-                message.header.frame_id = self._frame
-                message.header.stamp = time_message(max(o.stamp for o in outputs))
-                publisher.publish(message)
+        for name, publisher in self._listeners.heard().items():
+            message = MAKERS[name](outputs)
+            message.header.frame_id = self._frame
+            message.header.stamp = time_message(max(o.stamp for o in outputs))
+            publisher.publish(message)
         self._waiting.clear()
 
 

@@ -41,16 +41,17 @@ class Listener:
     """
     Somebody who takes one number out of each message of a source.
 
-    `is_sample`: of y, not of a known input, which a message gives first. `field` and `stamps`
-    (header, source or reception) are not known before the topic's type, and `error` says why its
-    type has no such field. `lacking` messages were without it; `why`: the latest one of them.
+    `is_sample`: of y, not of a known input, which a message gives first. `field`, the `element` of
+    a list that is meant by name, and `stamps` (header, source or reception) are not known before
+    the topic's type; `error` says why its type has no such field. `lacking` messages were without
+    it; `why`: the latest one of them.
     """
 
     def __init__(self, wanted: Input, take: Take, source: 'Source', is_sample: bool) -> None:
         self._wanted, self._take = wanted, take
         self.source, self.is_sample = source, is_sample
         self.field: Field | None = None
-        self.stamps = self.error = ''
+        self.stamps = self.error = self.element = ''
         self.lacking = 0
         self.why: MissingElementError | None = None
         self._unwrap: Unwrapper | None = None
@@ -63,7 +64,7 @@ class Listener:
         except ConfigurationError as error:
             self.error = str(error)
             return
-        self.stamps = self._wanted.stamp
+        self.stamps, self.element = self._wanted.stamp, self.field.key
         if self.stamps == 'auto':
             self.stamps = 'header' if self.field.header else 'source'
         self._unwrap = Unwrapper() if self.field.wraps else None

@@ -4,7 +4,9 @@
 from collections.abc import Callable, Iterable, Mapping
 from copy import copy
 import inspect
+import math
 import re
+from time import monotonic
 from typing import Any
 
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
@@ -14,6 +16,8 @@ from rclpy.qos import DurabilityPolicy, QoSPolicyKind, QoSProfile, ReliabilityPo
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.timer import Timer
 
+LOOK = 0.1
+"""Seconds; to find each other takes publishers and subscriptions longer than that."""
 DEPTH = 1000
 """
 A second of samples at 1 kHz. Fast DDS has been seen not to deliver for 0.2 s, seconds after a node
@@ -42,10 +46,28 @@ def create_publisher(node: Node, kind: Any, topic: str, latched: bool = False) -
     return node.create_publisher(kind, topic, qos, qos_overriding_options=OVERRIDABLE)
 
 
-def has_listeners(publisher: Any) -> bool:
-    """Return whether anybody listens; to a latched topic always those who come later."""
-    latched = DurabilityPolicy.TRANSIENT_LOCAL
-    return bool(publisher.get_subscription_count() or publisher.qos_profile.durability == latched)
+class Listeners:
+    """
+    Which topics of a node anybody listens to: a message that nobody hears need not be made.
+
+    The middleware is asked every `LOOK` seconds at most: asking takes as long as making one.
+    """
+
+    def __init__(self, publishers: Mapping[str, Any]) -> None:
+        self._publishers, self._looked = publishers, -math.inf
+        self._heard: dict[str, Any] = {}
+
+    def heard(self) -> dict[str, Any]:
+        """Return the publishers that are heard, by name; those of latched topics always are."""
+        now = monotonic()
+        if now - self._looked > LOOK:
+            self._looked, latched = now, DurabilityPolicy.TRANSIENT_LOCAL
+            self._heard = {
+                name: p
+                for name, p in self._publishers.items()
+                if p.get_subscription_count() or p.qos_profile.durability == latched
+            }
+        return self._heard
 
 
 def full_name(node: Node, topic: str) -> str:
