@@ -190,6 +190,7 @@ class Arm(Rig):
             lambda: self.send(**positions) and out and stamp_of(out[-1].message) > begin,
             f'estimates of {len(positions)} joints',
         )
+        self.user.wait(lambda: stamp_of(out[-1].message) == self.stamp, 'those of the last one')
         return out[-1].message
 
 
