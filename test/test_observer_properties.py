@@ -10,7 +10,8 @@ import pytest
 
 
 @given(any_law, st.integers(0, 200), st.integers(0, 200))
-def test_split_run_and_steps_equal_a_whole_run_and_each_estimate_is_a_copy(law, a, b):
+def test_split_run_and_steps_equal_a_whole_run_and_a_reset_forgets_it(law, a, b):
+    """Each estimate is a copy."""
     t, y, u = samples()
     whole, split, steps = (Observer(SMALL | law) for _ in range(3))
     expected = whole.run(t, y, u)
@@ -26,6 +27,8 @@ def test_split_run_and_steps_equal_a_whole_run_and_each_estimate_is_a_copy(law, 
     for name in ('z', 'unknown_input', 'gamma', 'innovation', 'status', 'open_levels'):
         column = [getattr(estimate, name) for estimate in found]
         np.testing.assert_array_equal(column, getattr(expected, name))
+    whole.reset()
+    assert_same_state(state_of(whole), state_of(Observer(SMALL | law)))
 
 
 def test_snapshot_of_another_variant_gives_a_power_that_fits():
