@@ -1,11 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Bags for tests, written by rosbags, and those of mcap's presets by the mcap package."""
 
-import contextlib
 import struct
 
 from fhaosmo_ros.tools.bags.types import header, serialise, TYPES
-from mcap.reader import NonSeekingReader
 from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
 import numpy as np
@@ -59,15 +57,6 @@ def write(path, messages, storage='mcap', compression='none', version=9):
                 connections[topic] = bag.add_connection(topic, message_type, typestore=TYPES)
             bag.write(connections[topic], int(stamp), data)
     return path
-
-
-def stamps_in(path, topic):
-    """Stamps of a topic in a storage file that is not complete: it grows, or was cut."""
-    found = []
-    with contextlib.suppress(Exception), path.open('rb') as file:
-        for _, _, message in NonSeekingReader(file).iter_messages([topic], log_time_order=False):
-            found.append(message.log_time)
-    return found
 
 
 def write_preset(path, messages, preset, published=None, parts=1):

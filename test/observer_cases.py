@@ -51,11 +51,19 @@ def states_of(rates, d, start=0.0, period=1e-3):
     return z
 
 
-def matern(count, rate, derivatives, rng):
-    """Return a d of size 1 at 1 kHz with so many derivatives, its corner at `rate` (rad/s)."""
+def discrete(rates, drive, period):
+    """Return transition and noise of x' = rates x + w over a period (Van Loan 1978)."""
+    n = len(rates)
+    whole = expm(np.block([[-rates, drive], [np.zeros_like(rates), rates.T]]) * period)
+    transition = whole[n:, n:].T
+    return transition, transition @ whole[:n, n:]
+
+
+def matern(count, rate, derivatives, rng, period=1e-3):
+    """Return a d of size 1 with so many derivatives, its corner at `rate` (rad/s)."""
     d = rng.standard_normal(count + 4000)
     for _ in range(derivatives + 1):
-        d = lfilter([1.0], [1.0, -math.exp(-rate * 1e-3)], d)
+        d = lfilter([1.0], [1.0, -math.exp(-rate * period)], d)
     return d[4000:] / d[4000:].std()
 
 

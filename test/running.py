@@ -33,8 +33,8 @@ OK, WARN, ERROR, STALE = b'\0', b'\1', b'\2', b'\3'
 QOS = QoSProfile(depth=10_000)
 LATCHED = QoSProfile(depth=1000, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 ESTIMATES = {
-    'state': Float64MultiArray, 'unknown_input': Float64, 'gamma': Float64,
-    'innovation': Float64MultiArray, 'stamp': Time,
+    'state': Float64MultiArray, 'unknown_input': Float64, 'innovation': Float64MultiArray,
+    'stamp': Time, 'gamma': Float64,
 }  # fmt: skip
 FED = {'publish_on': 'sample', 'max_gap': 60.0, 'diagnostics_period': 0.1}
 """For an estimator that a test feeds: each sample is answered at once, and no gap restarts it."""
@@ -48,6 +48,13 @@ def nanoseconds(stamp: Time) -> int:
 
 def as_time(stamp: int) -> Time:
     return Time(sec=stamp // SECOND, nanosec=stamp % SECOND)
+
+
+def plain(message: Time | Float64 | Float64MultiArray) -> int | float | list[float]:
+    """Return nanoseconds, or the numbers of a message."""
+    if isinstance(message, Time):
+        return nanoseconds(message)
+    return message.data if isinstance(message, Float64) else list(message.data)
 
 
 def values_of(status) -> dict[str, object]:
@@ -102,15 +109,16 @@ class Process(Child):
     def check_end(self) -> None:
         """Wait for the end after `interrupt`: a good one, with nothing terrible said."""
         assert self._may_end or self.wait() == 0, self.output()
-        assert 'Traceback' not in self.output(), self.output()
+        for word in ('Traceback', 'Exception', 'terminate called'):
+            assert word not in self.output(), self.output()
 
 
 Published = namedtuple('Published', 'stamp message')
 """A message with its source time stamp in nanoseconds."""
 Report = namedtuple('Report', 'time statuses')
 """A message on /diagnostics: its own time in nanoseconds, and statuses by their tasks."""
-Estimate = namedtuple('Estimate', 'stamp z unknown_input gamma innovation')
-"""What was published for one sample; gamma may be None."""
+Estimate = namedtuple('Estimate', 'z unknown_input innovation stamp gamma', defaults=[None])
+"""What was published for one sample, in the order of `ESTIMATES`; only fixed gains have gamma."""
 
 
 class User(PrivateNode):
@@ -190,14 +198,12 @@ class Parameters:
         self.service = AsyncParameterClient(user.node, node)
         user.wait(self.service.services_are_ready, f'parameter services of {node}')
 
-    def names(self) -> set[str]:
-        return set(self._answer(self.service.list_parameters).result.names)
-
-    def describe(self, *names: str) -> list:
-        return list(self._answer(self.service.describe_parameters, names).descriptors)
+    def ask(self, request: str, *given: object):
+        """Return the answer to a request of rclpy's AsyncParameterClient."""
+        return self._answer(getattr(self.service, request), *given)
 
     def messages(self, *names: str) -> list:
-        return list(self._answer(self.service.get_parameters, names).values)
+        return list(self.ask('get_parameters', names).values)
 
     def all(self, names) -> dict[str, object]:
         """Return values by name."""
@@ -211,7 +217,7 @@ class Parameters:
     def try_to_set(self, **values: object):
         """Return the result of setting one parameter, or several together; `lambda_`: lambda."""
         changes = [Parameter(name.rstrip('_'), value=value) for name, value in values.items()]
-        return self._answer(self.service.set_parameters_atomically, changes).result
+        return self.ask('set_parameters_atomically', changes).result
 
     def set(self, **values: object) -> None:
         result = self.try_to_set(**values)
@@ -302,7 +308,6 @@ class Estimator(Rig):
         }  # fmt: skip
         self._topic = f'{namespace}{part}/y'
         self.y = user.record(self._topic, Float64)
-        self._estimates: list[Estimate] = []
         # An estimate that nobody hears is not made. Readers are announced in order: once it has
         # written to this one, it knows those that this user made before.
         told = user.record(f'{node}/parameters', String, LATCHED)
@@ -332,17 +337,8 @@ class Estimator(Rig):
     @property
     def estimates(self) -> list[Estimate]:
         """What has been published; all topics have had all listeners from the first sample on."""
-        for k in range(len(self._estimates), min(map(len, self.topics.values()))):
-            found = {topic: messages[k].message for topic, messages in self.topics.items()}
-            self._estimates.append(
-                Estimate(
-                    nanoseconds(found['stamp']),
-                    list(found['state'].data), found['unknown_input'].data,
-                    found['gamma'].data if 'gamma' in found else None,
-                    list(found['innovation'].data),
-                )
-            )  # fmt: skip
-        return self._estimates
+        rows = zip(*self.topics.values(), strict=False)  # the last estimate may be on its way
+        return [Estimate(*(plain(published.message) for published in row)) for row in rows]
 
     def wait_estimate(self, condition, what: str) -> Estimate:
         return self.user.wait(lambda: [e for e in self.estimates[-50:] if condition(e)], what)[-1]

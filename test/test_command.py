@@ -14,29 +14,6 @@ from fhaosmo_ros.tools.cli.command import Output, run_command
 import pytest
 
 PARSER = argparse.ArgumentParser(prog='try')
-BUSY = """
-import argparse, os, signal, sys, time
-from pathlib import Path
-from fhaosmo_ros.tools.cli.command import Output, run_command
-from studies.harness import called
-
-def work(folder, k):
-    # Only the parent takes Ctrl-C, however busy the machine is.
-    assert {signal.SIGINT, signal.SIGHUP} <= signal.pthread_sigmask(signal.SIG_BLOCK, ())
-    (folder / f'{k}.pid').write_text(str(os.getpid()))
-    time.sleep(600)
-
-def body(arguments, stop):
-    folder = Path(sys.argv[1])
-    with Output(folder / 'out') as output:
-        output.path.mkdir()
-        called({k: (work, folder, k) for k in range(2)}, 'busy', 2, stop)
-
-if __name__ == '__main__':
-    parser = argparse.ArgumentParser(prog='busy')
-    parser.add_argument('folder')
-    sys.exit(run_command(parser, None, body))
-"""
 
 
 @pytest.mark.parametrize(('error', 'code', 'said'), [
@@ -136,31 +113,6 @@ def begin():
         process.communicate()
 
 
-@pytest.mark.signals
-@pytest.mark.parametrize(('number', 'ignored', 'group'), [
-    (signal.SIGINT, False, True),  # Ctrl-C in a terminal
-    (signal.SIGINT, True, False),  # kill -INT of a script's background job
-    (signal.SIGTERM, True, True),  # timeout(1)
-    (signal.SIGHUP, False, True),  # the terminal or the SSH connection closes
-    (signal.SIGKILL, False, False),
-])  # fmt: skip
-def test_signal_ends_command_and_workers(begin, tmp_path, number, ignored, group):
-    (tmp_path / 'busy.py').write_text(BUSY)
-    process = begin(tmp_path / 'busy.py', tmp_path, ignored=ignored)
-
-    def pids():
-        return [pid for path in tmp_path.glob('*.pid') if (pid := path.read_text())]
-
-    commands.wait_until(lambda: len(pids()) == 2, 'workers', process=process)
-    (os.killpg if group else os.kill)(process.pid, number)
-    out, err = process.communicate(timeout=60)
-    if number != signal.SIGKILL:
-        assert (process.returncode, out, err) == (130, '', 'busy: interrupted\n')
-        assert {p.name for p in tmp_path.iterdir()} == {'busy.py', '0.pid', '1.pid'}
-    left = [Path('/proc', pid) for pid in pids()]
-    commands.wait_until(lambda: not any(map(Path.exists, left)), 'end of workers')
-
-
 SLOW = """
 import sys
 from fhaosmo_ros.__main__ import COMMANDS, main
@@ -168,17 +120,39 @@ sys.path.insert(0, sys.argv[1])
 COMMANDS['slow'] = ('slow', '')
 raise SystemExit(main(['slow']))
 """
+LOADS = 'import time\nprint("begun", flush=True)\ntime.sleep(600)\n'
+WORKS = """
+import argparse, time
+from pathlib import Path
+from fhaosmo_ros.tools.cli.command import Output, run_command
+
+def body(arguments, stop):
+    with Output(Path(__file__).with_name('out')) as output, stop.raising():
+        output.path.mkdir()
+        print('begun', flush=True)
+        time.sleep(600)
+
+def main(argv):
+    return run_command(argparse.ArgumentParser(prog='slow'), argv, body)
+"""
 
 
 @pytest.mark.signals
-@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_signal_ends_a_command_that_still_loads(begin, tmp_path, number):
-    (tmp_path / 'slow.py').write_text('import time\nprint("loads", flush=True)\ntime.sleep(600)\n')
-    process = begin('-c', SLOW, tmp_path, ignored=True)
-    assert process.stdout.readline() == 'loads\n'
+@pytest.mark.parametrize(('number', 'ignored'), [
+    (signal.SIGINT, False),  # Ctrl-C in a terminal
+    (signal.SIGINT, True),  # kill -INT of a script's background job
+    (signal.SIGTERM, True),  # timeout(1)
+    (signal.SIGHUP, False),  # the terminal or the SSH connection closes
+])  # fmt: skip
+@pytest.mark.parametrize('module', [LOADS, WORKS], ids=['loads', 'works'])
+def test_signal_ends_a_command_that_loads_or_works(begin, tmp_path, module, number, ignored):
+    (tmp_path / 'slow.py').write_text(module)
+    process = begin('-c', SLOW, tmp_path, ignored=ignored)
+    assert process.stdout.readline() == 'begun\n'
     process.send_signal(number)
-    assert process.wait(60) == 130
-    assert process.stderr.read() == ''
+    _, error = process.communicate(timeout=60)
+    assert (process.returncode, error) == (130, '' if module == LOADS else 'slow: interrupted\n')
+    assert {p.name for p in tmp_path.iterdir()} <= {'slow.py', '__pycache__'}
 
 
 @pytest.mark.signals

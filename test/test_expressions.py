@@ -76,11 +76,6 @@ def test_anything_else_is_refused_in_one_line(text, recwarn):
     assert not recwarn.list
 
 
-def test_wrong_number_of_expressions_is_refused():
-    with pytest.raises(ConfigurationError, match=r"^parameter 'phi': expected 2 expr.*got 3"):
-        TriangularModel(['0', '0', '0'], 2)
-
-
 @given(ANY_TEXT | st.text('z1u23+-*/().e sincoexplgqrtab', max_size=40))
 def test_any_text_is_either_an_expression_or_an_error(text):
     try:

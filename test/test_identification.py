@@ -3,7 +3,6 @@
 
 import bag_files as files
 from fhaosmo_ros.core import ConfigurationError, Family, Observer, OnlineEstimator, TriangularModel
-from fhaosmo_ros.core.observer.kalman import LinearModel, stationary
 from fhaosmo_ros.core.parameters.files import load
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
 from fhaosmo_ros.core.simulation.metrics import rms
@@ -13,35 +12,25 @@ from fhaosmo_ros.tools.tuning.identify import make_gains, run
 from fhaosmo_ros.tools.tuning.likelihood import Design
 from fhaosmo_ros.tools.tuning.report import notes
 import numpy as np
+from observer_cases import matern, states_of
 import pytest
 from scipy.signal import lfilter
 
 H, K = 5e-3, 4000
 PHI = ['0', '-2*z2']
 NOISE, SIZE, RATE = 1e-3, 1.0, 2.0
-RATES = np.array(
-    [[0.0, 1.0, 0.0, 0.0], [0.0, -2.0, 1.0, 0.0], [0.0, 0.0, -RATE, 1.0], [0.0, 0.0, 0.0, -RATE]]
-)
-"""A plant of order 2 and a Matern d with one derivative (D 17)."""
+"""Of the noise on y, and of a Matern d with one derivative (D 17)."""
 T = np.arange(K) * H
 
 
-def plant(seed=1, size=SIZE):
-    """Return the states z1, z2, d, d' of the very process that D 17 describes."""
-    random = np.random.default_rng(seed)
-    q = size**2 * (2.0 * RATE) ** 3 / 2.0
-    a, added = LinearModel(RATES, q).transition(H)
-    x, states = np.zeros(4), np.empty((K, 4))
-    x[2:] = np.linalg.cholesky(stationary(RATES[2:, 2:], q)) @ random.standard_normal(2)
-    shocks = random.standard_normal((K, 4)) @ np.linalg.cholesky(added).T
-    for k in range(K):
-        x = a @ x + shocks[k]
-        states[k] = x
-    return states
+def plant():
+    """Return the states z1, z2 and d."""
+    d = SIZE * matern(K, RATE, 1, np.random.default_rng(1), H)
+    return np.column_stack([states_of(np.array([[0.0, 1.0], [0.0, -2.0]]), d, period=H), d])
 
 
-def noise(seed=2):
-    return NOISE * np.random.default_rng(seed).standard_normal(K)
+def noise():
+    return NOISE * np.random.default_rng(2).standard_normal(K)
 
 
 def found_in(y, phi=PHI, **given):

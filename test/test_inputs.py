@@ -18,8 +18,8 @@ def made(kind, **fields):
 
 
 def joints(names):
-    lists = {'position': np.array([1.0, 2.0]), 'velocity': NONE, 'effort': NONE}
-    return made(files.JOINTS, header=files.header(1_000_000_002), name=names, **lists)
+    data = files.joint_state(1_000_000_002, [1.0, 2.0], names)
+    return files.TYPES.deserialize_cdr(data, files.JOINTS)
 
 
 POINT = made(

@@ -1,16 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """What import-linter cannot see: imports of compiled modules, and what an import really loads."""
 
-from pathlib import Path
 import re
 import subprocess
 import sys
 
+from commands import ROOT
 import pytest
 
 tomllib = pytest.importorskip('tomllib', reason='Python 3.10 has no tomllib')
 
-ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / 'fhaosmo_ros'
 IMPORT = re.compile(r'^\s*(?:from|import|cimport)\s+(fhaosmo_ros[\w.]*)', re.MULTILINE)
 

@@ -10,9 +10,10 @@ import pytest
 
 
 @given(any_law, st.integers(0, 200), st.integers(0, 200))
-def test_split_run_equals_whole_run(law, a, b):
+def test_split_run_and_steps_equal_a_whole_run_and_a_reset_forgets_it(law, a, b):
+    """Each estimate is a copy."""
     t, y, u = samples()
-    whole, split = Observer(SMALL | law), Observer(SMALL | law)
+    whole, split, steps = (Observer(SMALL | law) for _ in range(3))
     expected = whole.run(t, y, u)
     parts = (np.split(column, sorted([a, b])) for column in (t, y, u))
     runs = [split.run(*part) for part in zip(*parts, strict=True)]
@@ -20,19 +21,14 @@ def test_split_run_equals_whole_run(law, a, b):
     for name, got, wanted in zip(expected._fields, parts, expected, strict=True):
         np.testing.assert_array_equal(got, wanted, err_msg=name)
     assert_same_state(state_of(split), state_of(whole))
-
-
-@laws
-def test_steps_equal_a_run_and_each_estimate_is_a_copy(law):
-    t, y, u = samples()
-    expected = Observer(SMALL | law).run(t, y, u)
-    observer, found = Observer(SMALL | law), []
-    for k in range(len(t)):
-        known = observer.started
-        found.append(observer.step(y[k], t[k] - t[k - 1], u[k]) if known else observer.start(y[k]))
+    found = []
+    for h, y_k, u_k in zip(np.diff(t, prepend=0.0), y, u, strict=True):
+        found.append(steps.step(y_k, h, u_k) if steps.started else steps.start(y_k))
     for name in ('z', 'unknown_input', 'gamma', 'innovation', 'status', 'open_levels'):
         column = [getattr(estimate, name) for estimate in found]
         np.testing.assert_array_equal(column, getattr(expected, name))
+    whole.reset()
+    assert_same_state(state_of(whole), state_of(Observer(SMALL | law)))
 
 
 def test_snapshot_of_another_variant_gives_a_power_that_fits():
@@ -41,14 +37,6 @@ def test_snapshot_of_another_variant_gives_a_power_that_fits():
         observer = Observer(SMALL | {'variant': 'fuzzy_adaptive'} | other)
         observer.structure.load_state_dict(state_of(adaptive))
         assert state_of(observer)['gamma'] == power
-
-
-def test_reset_equals_a_new_observer():
-    observer = Observer(SMALL)
-    observer.run(*samples())
-    observer.reset()
-    assert_same_state(state_of(observer), state_of(Observer(SMALL)))
-    assert not observer.started
 
 
 @laws

@@ -174,8 +174,12 @@ def test_snapshot_of_other_entries_or_sizes_is_refused():
     labels, vector = pack(Snapshot(5, Flag(0), OnlineEstimator().state_dict()))
     with pytest.raises(ConfigurationError, match='entries'):
         unpack(np.zeros(8), labels)
-    with pytest.raises(ConfigurationError, match='entries'):
-        unpack(vector, [*labels[:-1], labels[0]])
+    swapped = list(labels)
+    k = swapped.index('z_hat1')
+    swapped[k : k + 2] = 'z_hat2', 'z_hat1'
+    for names in ([*labels[:-1], labels[0]], swapped):
+        with pytest.raises(ConfigurationError, match='entries'):
+            unpack(vector, names)
     for names in ([], ['flags'], labels[4:]):
         with pytest.raises(ConfigurationError, match='version'):
             unpack(np.zeros(len(names)), names)

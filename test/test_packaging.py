@@ -11,12 +11,12 @@ import sys
 from types import SimpleNamespace
 from unittest.mock import MagicMock
 
+from commands import ROOT
 import fhaosmo_ros
 from fhaosmo_ros.__main__ import main
 from fhaosmo_ros.commands import COMMANDS
 import pytest
 
-ROOT = Path(__file__).resolve().parents[1]
 NAME = 'fhaosmo_ros'
 # A sourced ROS or overlay would leak into the builds and plans below.
 SOURCED = ('AMENT_PREFIX_PATH', 'CMAKE_PREFIX_PATH', 'COLCON_PREFIX_PATH', 'ROS_DISTRO')
@@ -110,37 +110,6 @@ def test_colcon_installs_executables_and_data(options, wheel, checkout, tmp_path
     imported = Path(sourced(f'{sys.executable} -c "{query}"').strip())
     assert imported.resolve().is_relative_to(checkout if options else installed)
     assert '--duration' in sourced(f'{prefix}/lib/{NAME}/demo --help')
-
-
-SMALL = {
-    '__init__.py': "__version__ = '0'", 'commands.py': 'COMMANDS = {}',
-    'number.pxd': 'cdef enum: NUMBER = 3', 'other.pyx': 'number = 1',
-    'taken.pyx': 'from fhaosmo_ros.number cimport NUMBER\nnumber = NUMBER\n',
-}  # fmt: skip
-
-
-def test_only_what_has_changed_is_built(tmp_path):
-    """Of a package of two small extensions; a normal build is not taken for one with checks."""
-
-    def build(debug: int = 1) -> dict[str, int]:
-        """Return when each extension was compiled (ns)."""
-        command = (sys.executable, 'setup.py', '-q', 'build_ext', '-i')
-        assert run(*command, cwd=tmp_path, FHAOSMO_DEBUG=debug) == ''
-        libraries = (tmp_path / 'build').glob('lib*/**/*.so')
-        return {path.name.split('.')[0]: path.stat().st_mtime_ns for path in libraries}
-
-    (tmp_path / NAME).mkdir()
-    for name, text in SMALL.items():
-        (tmp_path / NAME / name).write_text(text)
-    for name in ('setup.py', 'setup.cfg'):
-        shutil.copy(ROOT / name, tmp_path)
-    first = build()
-    assert build() == first
-    (tmp_path / NAME / 'number.pxd').write_text('cdef enum: NUMBER = 4')
-    second = build()
-    assert second['other'] == first['other']
-    assert second['taken'] > first['taken']
-    assert build(debug=0)['other'] > second['other']
 
 
 @pytest.fixture

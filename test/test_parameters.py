@@ -10,10 +10,7 @@ from fhaosmo_ros.core import ConfigurationError, Observer
 from fhaosmo_ros.core.parameters.declaration import Parameter
 from fhaosmo_ros.core.parameters.files import complete, dumps, load, loads, select
 from fhaosmo_ros.core.parameters.removed import REMOVED
-from fhaosmo_ros.core.parameters.tables import (
-    ESTIMATOR_PARAMETERS,
-    NODE_TABLES,
-)
+from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS, NODE_TABLES
 from fhaosmo_ros.core.parameters.yaml_text import MAX_DEPTH, MAX_LENGTH, parse
 from fhaosmo_ros.tools.cli.options import add_parameter_options, assigned, channel_parameters
 from hypothesis import given, HealthCheck, settings

@@ -164,14 +164,3 @@ def test_noise_quantisation_jitter_and_dropouts_are_as_asked():
     np.testing.assert_allclose(np.std(off), np.hypot(1e-4, 2e-4), rtol=0.1)
     y = Family(SHORT | {'quantisation': 0.01}).recording(0).y
     np.testing.assert_allclose(y / 0.01, np.round(y / 0.01), atol=1e-9)
-
-
-@pytest.mark.parametrize(('parameters', 'message'), [
-    ({'band_of_d': [3.0, 1.0]}, 'band_of_d.*lower one first'),
-    ({'disturbances': ['sine']}, "disturbances.*did you mean 'sines'|disturbances.*sines"),
-    (SHORT | {'phi': ['0', '0', 'z3**3'], 'rms_of_d': 100.0}, 'stay finite'),
-])  # fmt: skip
-def test_bad_family_is_one_line(parameters, message):
-    with pytest.raises(ConfigurationError, match=message) as error:
-        Family(parameters).recording(0)
-    assert '\n' not in str(error.value)

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The commands record, play and demo beside live nodes: complete bags, and no process left."""
 
+from contextlib import suppress
 import os
 import re
 import shlex
@@ -16,9 +17,10 @@ from commands import COMMAND, environment, interrupted, ROOT, run, start, wait_u
 from domains import take_domain
 from fhaosmo_ros.nodes.middleware.messages import message_class
 from fhaosmo_ros.tools.bags.reader import BagReader
-from fhaosmo_ros.tools.bags.topics import read_ticks, series
+from fhaosmo_ros.tools.bags.topics import read_ticks
 from fhaosmo_ros.tools.demo import OTHERS, read_run
 from fhaosmo_ros.topics import ESTIMATES, EVENT, PARAMETERS, SNAPSHOT
+from mcap.reader import NonSeekingReader
 import numpy as np
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import get_types_from_msg
@@ -39,7 +41,12 @@ def size(folder):
 
 
 def stamps(folder, topic):
-    return files.stamps_in(folder / f'{folder.name}_0.mcap', topic)
+    """Stamps of a topic in a storage file that is not complete: it grows, or was cut."""
+    found = []
+    with suppress(Exception), (folder / f'{folder.name}_0.mcap').open('rb') as file:
+        for _, _, message in NonSeekingReader(file).iter_messages([topic], log_time_order=False):
+            found.append(message.log_time)
+    return found
 
 
 def wait_for_more(bag, length, process):
@@ -157,15 +164,6 @@ def test_full_disk_leaves_what_was_recorded(live, tmp_path):
     assert len(stamps(tmp_path / 'bag', '/y')) > 1500
 
 
-def plant_package(folder, name):
-    """Write a package of messages whose import leaves a file; return that file."""
-    mark = folder / 'imported'
-    (folder / name / 'msg').mkdir(parents=True)
-    (folder / name / '__init__.py').write_text(f"open({str(mark)!r}, 'w').close()\n")
-    (folder / name / 'msg' / '__init__.py').write_text('class Thing:\n    pass\n')
-    return mark
-
-
 def test_bag_is_played_in_its_own_time_and_an_estimator_restarts_where_it_begins_again(tmp_path):
     """With names, remappings and the arguments that launch adds, also those without a meaning."""
     remapped = (
@@ -173,8 +171,6 @@ def test_bag_is_played_in_its_own_time_and_an_estimator_restarts_where_it_begins
         '-p', 'use_sim_time:=true', '--params-file', tmp_path / 'none.yaml',
     )  # fmt: skip
     (tmp_path / 'none.yaml').write_text('none: {ros__parameters: {}}')
-    # The names in a bag come from strangers: a package beside it is not imported.
-    mark = plant_package(tmp_path, 'planted_msgs')
     files.TYPES.register(get_types_from_msg('float64 data', 'planted_msgs/msg/Thing'))
     stamps, y = files.signal(1000)
     thing = '/x', 'planted_msgs/msg/Thing', int(stamps[-1]), files.float64(1.0)
@@ -194,16 +190,19 @@ def test_bag_is_played_in_its_own_time_and_an_estimator_restarts_where_it_begins
         said = [interrupted(process)[0] for process in processes]
     assert 'not played: /x: planted_msgs/msg/Thing is not installed here' in said[0]
     assert 'playing 1 topics' in said[0]
-    assert not mark.exists()
     with BagReader(tmp_path / 'out') as reader:
         times = [time for _, time, _, _ in reader.messages(['/rig/y'])]
     assert (times[-1] - times[0]) / len(times) > 200_000  # 1 ms, less what play was held up
 
 
 def test_only_installed_message_types_have_a_class(tmp_path, monkeypatch):
+    """Names in a bag come from strangers: no other package that has such a name is imported."""
     assert message_class('std_msgs/msg/Float64').__name__ == 'Float64'
     site_packages = tmp_path / 'install' / 'lib' / 'python3' / 'site-packages'
-    mark = plant_package(site_packages, 'workspace_msgs')
+    package, mark = site_packages / 'workspace_msgs', tmp_path / 'imported'
+    (package / 'msg').mkdir(parents=True)
+    (package / '__init__.py').write_text(f"open({str(mark)!r}, 'w').close()\n")
+    (package / 'msg' / '__init__.py').write_text('class Thing:\n    pass\n')
     monkeypatch.syspath_prepend(site_packages)
     for name in ('workspace_msgs/msg/Thing', 'std_msgs/msg/Nothing', 'os/msg/Path', ''):
         with pytest.raises(LookupError, match='expected a message type that is installed here'):
@@ -232,7 +231,7 @@ def test_run_leaves_a_report_a_figure_and_a_bag_but_no_process(tmp_path):
     assert (folder / 'report.txt').read_text().strip() in out
     with AnyReader([folder / 'bag']) as reader:
         topics = {c.topic for c in reader.connections}
-    found = [f'/estimator/{part}' for part in (*ESTIMATES, SNAPSHOT, PARAMETERS)]
+    found = [f'/estimator/{part}' for part in (*ESTIMATES, 'tuning', SNAPSHOT, PARAMETERS)]
     assert {'/y', '/plant/state', '/plant/unknown_input', *found} <= topics
     run_ = read_run(folder / 'bag')
     assert len(run_.y.stamps) > 1000
@@ -241,12 +240,6 @@ def test_run_leaves_a_report_a_figure_and_a_bag_but_no_process(tmp_path):
     # Not d: other tests load the machine meanwhile, and its stamps jitter in bursts then.
     error = np.median(np.abs(run_.errors[late, :2]), axis=0)
     assert (error < 0.05 * np.abs(run_.curves.truth[late, :2]).max(axis=0)).all()
-    # Of the last samples that are not the same: estimates go on where the plant ends first.
-    end = np.unique(run_.rows, return_index=True)[1][-50:]
-    true = np.std(run_.y.values.ravel()[run_.rows[end]] - run_.curves.truth[end, 0])
-    assert true > 0.5e-4
-    noise = np.median(series(folder / 'bag', '/estimator/tuning').values[-500:, 0])
-    assert noise > 0.5 * true  # jitter of a busy machine adds to it
 
 
 def test_ctrl_c_ends_early_with_a_report_and_without_a_trace(tmp_path):

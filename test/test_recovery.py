@@ -3,17 +3,13 @@
 
 from functools import cache
 import math
-from pathlib import Path
 
+from commands import ROOT
 from fhaosmo_ros.core.observer.observer import Observer
 from fhaosmo_ros.core.observer.status import Status
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.parameters.files import load
-from fhaosmo_ros.core.parameters.tables import (
-    OBSERVER_PARAMETERS,
-    ONLINE_PARAMETERS,
-    PLANT_PARAMETERS,
-)  # fmt: skip
+from fhaosmo_ros.core.parameters.tables import ONLINE_PARAMETERS, PLANT_PARAMETERS
 from fhaosmo_ros.core.simulation.metrics import rms
 from fhaosmo_ros.core.simulation.plant import Plant
 from fhaosmo_ros.tools.tuning.objective import stamps_of
@@ -23,7 +19,7 @@ import pytest
 from scipy.optimize import brentq
 from scipy.stats import norm
 
-CONFIG = Path(__file__).resolve().parents[1] / 'config'
+CONFIG = ROOT / 'config'
 FILES = [
     path for path in sorted(CONFIG.glob('**/*.yaml'))
     if {'noise_size', 'correction_period'} <= load(path, 'estimator', ONLINE_PARAMETERS).keys()
@@ -48,19 +44,15 @@ class Case:
         self.usual = self.errors(self.y, self.d)[len(self.t) // 4 :].max()
         self.settled = max(1.5 * self.usual, 0.1 * self.largest)
 
-    def observed(self, y, **changes):
+    def observed(self, y):
         """Return what an observer estimates, and that observer."""
-        own = {k: v for k, v in self.parameters.items() if k in OBSERVER_PARAMETERS}
-        observer = Observer(own | changes)
-        return observer.run(self.t[: len(y)], y, 0.0), observer
+        observer = Observer.from_yaml(self.path)
+        return observer.run(self.t, y, 0.0), observer
 
-    def errors(self, y, d, bare=False, part=1, **changes):
-        """Return |error of d| of the node's estimator, or of the observer alone."""
-        if bare:
-            found, _ = self.observed(y, **changes)
-        else:
-            estimator = OnlineEstimator(self.parameters | changes)
-            found = estimator.run(stamps_of(self.t[: len(y) : part]), y[::part], 0.0)
+    def errors(self, y, d, part=1, **changes):
+        """Return |error of d| of the node's estimator."""
+        estimator = OnlineEstimator(self.parameters | changes)
+        found = estimator.run(stamps_of(self.t[: len(y) : part]), y[::part], 0.0)
         return np.abs(found.unknown_input - d[::part])
 
     def shifted(self, begin, end, offset):
@@ -83,37 +75,31 @@ def pendulum():
     return case_of(CONFIG / 'models' / 'pendulum.yaml')
 
 
-bare_too = pytest.mark.parametrize('bare', [False, True], ids=['node', 'bare'])
-
-
-@bare_too
 @pytest.mark.parametrize('offset', [0.0, 0.1, 1.0, -10.0, 1000.0])
-def test_start_and_sensor_that_is_wrong_for_half_a_second(case, offset, bare):
-    wrong = case.errors(case.shifted(HIT, BACK, offset), case.d, bare)
+def test_start_and_sensor_that_is_wrong_for_half_a_second(case, offset):
+    wrong = case.errors(case.shifted(HIT, BACK, offset), case.d)
     assert wrong[:HIT].max() < 1.5 * case.largest
     assert wrong[SOON : HIT if offset else None].max() < case.settled
     assert wrong.max() < 2.0 * case.largest
     assert wrong[BACK + SOON :].max() < case.settled
 
 
-@bare_too
 @pytest.mark.parametrize(('name', 'factor'), [
     ('state_sizes', 0.1), ('state_sizes', 10.0), ('unknown_input_size', 1 / 3),
     ('unknown_input_size', 3.0), ('noise_size', 1 / 3), ('noise_size', 3.0),
 ])  # fmt: skip
-def test_start_with_sizes_that_are_wrong(case, name, factor, bare):
+def test_start_with_sizes_that_are_wrong(case, name, factor):
     right = case.parameters[name]
     size = [factor * x for x in right] if isinstance(right, list) else factor * right
-    assert case.errors(case.y, case.d, bare, **{name: size}).max() < 1.5 * case.largest
+    assert case.errors(case.y, case.d, **{name: size}).max() < 1.5 * case.largest
 
 
-@bare_too
 @pytest.mark.parametrize('earlier', [1, 3, 5])
-def test_plant_that_goes_back_in_its_motion(case, earlier, bare):
+def test_plant_that_goes_back_in_its_motion(case, earlier):
     """As a simulator that is reset, or a bag that begins again; all states jump."""
     order = np.concatenate([np.arange(HIT), np.arange(HIT - earlier * RATE, len(case.t))])
     order = order[: len(case.t)]
-    wrong = case.errors(case.y[order], case.d[order], bare)
+    wrong = case.errors(case.y[order], case.d[order])
     assert wrong[HIT:].max() < 2.0 * case.largest
     assert wrong[HIT + SOON :].max() < case.settled
 
@@ -193,18 +179,6 @@ def test_another_rate(case, part):
         assert wrong[8 * RATE // part :].max() < 3.0 * case.largest
 
 
-@pytest.mark.parametrize('offset', [1.0, -10.0])
-def test_papers_gains_find_y_again(offset):
-    """They have no sizes, and no noise: the paper's observer, as it is."""
-    t = np.arange(16 * RATE) / RATE
-    truth = Plant({'noise_std': 0.0}).simulate(t)
-    y = truth.y + offset * ((t >= HIT / RATE) & (t < BACK / RATE))
-    found = OnlineEstimator.from_yaml(CONFIG / 'paper.yaml').run(stamps_of(t), y)
-    wrong = np.abs(found.unknown_input - truth.unknown_input)
-    assert wrong[14 * RATE :].max() < 3.0 * wrong[4 * RATE : HIT].max()
-    assert wrong.max() < 40.0 * np.abs(truth.unknown_input).max()  # these gains have such peaks
-
-
 def test_cascade_goes_on_from_its_start_as_a_kalman_filter():
     """Its levels are put where they would be had they followed it; else they search for long."""
     t = np.arange(3 * RATE) / RATE
@@ -272,15 +246,3 @@ def test_innovations_that_stay_on_one_side_are_no_outliers():
     assert (counted[:20] < 2.1).all()
     assert (counted[20:] == 4.0).all()
     assert limits[-1] > 1.95
-
-
-@pytest.mark.parametrize('power', range(10))
-def test_bare_observer_comes_back_from_anywhere(power):
-    """Saturated levels alone would never find y again; no monitor takes part."""
-    t = np.arange(14 * RATE) / RATE
-    truth = Plant({'noise_std': 1e-3}).simulate(t)
-    far = {'noise_size': 0.0, 'start_from_measurement': False}
-    far['initial_estimate'] = [10.0**power, 0.0, 0.0, 0.0]
-    gains = load(CONFIG / 'noise_1e-3.yaml', 'estimator', OBSERVER_PARAMETERS)
-    wrong = np.abs(Observer(gains | far).run(t, truth.y).unknown_input - truth.unknown_input)
-    assert wrong[11 * RATE :].max() < 0.2

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """A bag, or a CSV file, replayed is the observer's own result."""
 
-from pathlib import Path
 import sqlite3
 
 import bag_files as files
+from commands import ROOT
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.parameters.files import dumps
 from fhaosmo_ros.tools.bags.reader import BagReader
@@ -14,7 +14,6 @@ from fhaosmo_ros.tools.replay import command as replay
 import numpy as np
 import pytest
 
-ROOT = Path(__file__).resolve().parents[1]
 STAMPS, Y = files.signal(3000)
 
 
@@ -190,11 +189,6 @@ SINE, U = 0.1 * np.sin(T), np.cos(9.0 * T)
 MODEL = {'order': 2, 'phi': ['0', '-z1 + torque'], 'inputs': ['torque']}
 
 
-def run_table(path, *arguments):
-    given = [text for name, value in MODEL.items() for text in ('-p', f'{name}:={value}')]
-    return run(path, *given, '-o', path.with_suffix('.npz'), *arguments)
-
-
 @pytest.mark.parametrize(('first', 'delimiter', 'arguments'), [
     ('t,angle,torque', ',', []),
     ('torque;x;"angle";t', ';', ['--columns', 't, angle, torque']),
@@ -208,23 +202,11 @@ def test_csv_file_is_estimated_as_its_arrays(tmp_path, first, delimiter, argumen
     lines = [delimiter.join(map(repr, map(float, row))) for row in zip(*columns, strict=True)]
     path = tmp_path / 'my.csv'
     path.write_text('\n'.join([first, *lines][not first :]).replace('nan', ''))
-    assert run_table(path, *arguments) == 0
+    given = [text for name, value in MODEL.items() for text in ('-p', f'{name}:={value}')]
+    assert run(path, *given, '-o', tmp_path / 'my.npz', *arguments) == 0
     stamps = np.maximum(np.round(T * 1e9).astype(np.int64), 1)
     expected = OnlineEstimator(MODEL).run(stamps, y, U)
     used = np.isfinite(y)
     with np.load(tmp_path / 'my.npz') as found:
         np.testing.assert_array_equal(found['stamp_ns'], stamps[used])
         np.testing.assert_array_equal(found['unknown_input'], expected.unknown_input[used])
-
-
-@pytest.mark.parametrize(('text', 'columns', 'said'), [
-    ('t,y,u\n0,1,2\n0.001,x,3\n', '', 'my.csv: expected lines of numbers: could not convert str'),
-    ('', '', '--columns: expected 3 titles, of the time, y, torque, got'),
-    ('t,angle,u\n0,1,2\n', 't,anlge,u', "t, angle, u, got 'anlge'; did you mean 'angle'?"),
-    ('t,y,u\nnan,1,2\n', '', 'my.csv: expected times of 0 to 9.2e+09 s, got nan in sample 0'),
-])  # fmt: skip
-def test_bad_table_is_said_in_one_line(tmp_path, capsys, text, columns, said):
-    (tmp_path / 'my.csv').write_text(text)
-    assert run_table(tmp_path / 'my.csv', '--columns', columns) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert said in line

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Copies, threads, hostile snapshots and calls: an error or a good estimate, never a crash.
+Copies, threads, hostile snapshots: an error or a good estimate, never a crash.
 
-HOSTILE=100000 in the environment makes so many snapshots and calls of each kind: for a build with
-bounds checks (FHAOSMO_DEBUG=1), or with AddressSanitizer.
+HOSTILE=100000 in the environment makes so many snapshots of each kind: for a build with bounds
+checks (FHAOSMO_DEBUG=1), or with AddressSanitizer.
 """
 
 from concurrent.futures import ThreadPoolExecutor
@@ -13,8 +13,7 @@ import math
 import os
 import pickle
 
-from fhaosmo_ros.core import ConfigurationError, Observer, OnlineEstimator
-from fhaosmo_ros.core.parameters.tables import OBSERVER_PARAMETERS
+from fhaosmo_ros.core import ConfigurationError, OnlineEstimator
 import numpy as np
 import pytest
 
@@ -24,9 +23,7 @@ WILD = (
     -(2**31), 2**53, 2**63, 240.0, 1e9, -7.5, 0.3,
 )  # fmt: skip
 """Numbers at the ends of what types hold, and some that could pass for a count or an index."""
-WILD_STAMPS = (0, 1, -1, 10**9, 2**31, 2**62, 2**63 - 1, -(2**63), 2**64, 10**30, 5 * 10**6)
 NO_NUMBERS = (None, 'text', [], {}, b'1', (1.0, 2.0), 3 + 4j)
-REFUSALS = (ConfigurationError, TypeError, ValueError, IndexError, OverflowError)
 SECOND_ORDER = {'order': 2, 'phi': ['0', '-z2 - 3*sin(z1) + u']}
 KINDS = {
     'cascade': {},
@@ -78,11 +75,6 @@ def damaged(values, rng):
     return found
 
 
-def assert_finite(estimator):
-    e = estimator.estimate
-    assert e is None or np.isfinite([*e.z, e.unknown_input, e.gamma]).all(), e
-
-
 @pytest.mark.parametrize('duplicate', [
     copy.copy, copy.deepcopy, lambda x: pickle.loads(pickle.dumps(x)),  # noqa: S301
 ])  # fmt: skip
@@ -106,70 +98,27 @@ def test_hostile_snapshots(kind):
         with contextlib.suppress(ConfigurationError):
             estimator.load_state_dict(damaged(good, rng))
             for k in range(5):
-                estimator.update(10**9 + (301 + k) * 10**6, 0.1)
-                assert_finite(estimator)
+                e = estimator.update(10**9 + (301 + k) * 10**6, 0.1)
+                assert e is None or np.isfinite([*e.z, e.unknown_input, e.gamma]).all(), e
     estimator.load_state_dict(good)
-
-
-@kinds
-def test_hostile_calls(kind):
-    """Call with numbers, and with what is no number, in any order."""
-    rng = np.random.default_rng(4)
-
-    def wild(*others):
-        values = [*WILD, *NO_NUMBERS, *others, *rng.normal(size=20)]
-        return values[rng.integers(len(values))]
-
-    def stamp():
-        return wild(*WILD_STAMPS, *range(10**9, 2 * 10**9, 10**7))
-
-    estimator = running(KINDS[kind], 50, 4)
-    observer = Observer({k: v for k, v in KINDS[kind].items() if k in OBSERVER_PARAMETERS})
-    calls = (
-        lambda: estimator.update(stamp(), wild()),
-        lambda: estimator.set_input(wild(), wild()),
-        lambda: estimator.run([stamp()] * 3, [wild(), wild(), 0.1]),
-        lambda: observer.step(wild(), wild(), wild()),
-        lambda: observer.run([0.0, 1e-3, 2e-3], [wild(), 0.1, wild()], wild()),
-        lambda: observer.start(wild()),
-        estimator.reset,
-    )
-    for _ in range(HOSTILE or 200):
-        with contextlib.suppress(*REFUSALS):
-            calls[rng.integers(len(calls))]()
-        assert_finite(estimator)
 
 
 @pytest.mark.parametrize('kind', ['cascade', 'self-tuning'])
 def test_two_threads_on_one_estimator_get_an_error(kind):
     estimator, stamps = running(KINDS[kind], 100, 1), 2 * 10**9 + np.arange(20_000) * 10**6
-
-    def use():
-        with ThreadPoolExecutor(1) as other:
-            for _ in range(100):
-                run = other.submit(estimator.run, stamps, np.zeros(len(stamps)))
-                while not run.done():
-                    estimator.update(0, 0.1)
-                run.result()
-
-    with pytest.raises(RuntimeError, match='another thread'):
-        use()
+    refused = pytest.raises(RuntimeError, match='another thread')
+    with refused, ThreadPoolExecutor(1) as other:
+        for _ in range(100):
+            run = other.submit(estimator.run, stamps, np.zeros(len(stamps)))
+            while not run.done():
+                estimator.update(0, 0.1)
+            run.result()
     assert np.isfinite(estimator.observer.estimate.z).all()
 
 
-@pytest.mark.parametrize('call', [
-    lambda e: e.policy.run(STAMPS[:2], Y, np.zeros((len(Y), 1))),
-    lambda e: e.policy.run(STAMPS, Y, np.zeros((2, 1))),
-    lambda e: e.policy.run(STAMPS, Y, np.zeros((len(Y), 2))),
-    lambda e: e.policy.configure(
-        Observer({'inputs': ['a', 'b']}).structure, e._settings(e.parameters)
-    ),
-])  # fmt: skip
-@kinds
-def test_compiled_code_takes_no_arrays_of_other_sizes(kind, call):
+def test_compiled_code_takes_no_arrays_of_other_sizes():
     """It reads arrays without looking at their ends: who calls it from Python is refused."""
-    estimator = running(KINDS[kind], 50, 5)
-    before = estimator.state_dict()
-    with pytest.raises(ValueError, match=r'expected|arrays'):
-        call(estimator)
-    np.testing.assert_equal(estimator.state_dict(), before)
+    policy, none = running({}, 50, 5).policy, np.zeros((len(Y), 0))
+    for arrays in ((STAMPS[:2], Y, none), (STAMPS, Y, none[:2]), (STAMPS, Y, np.zeros((200, 2)))):
+        with pytest.raises(ValueError, match=r'expected|arrays'):
+            policy.run(*arrays)

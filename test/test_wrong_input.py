@@ -7,11 +7,13 @@ import bag_files as files
 from fhaosmo_ros.__main__ import main
 from fhaosmo_ros.tools.cli.command import shipped
 import pytest
+from robots import URDF
 
 TUNE = (
     'tune -o out -pscheme:=explicit -pduration:=4.0 -pintegration_step:=1e-3 -psample_rate:=200.0 '
     '-precordings:=1 -pheld_out:=1 -psettled:=1.0 '
 )
+TABLE = "replay -p order:=2 -p phi:=['0','torque'] -p inputs:=[torque] "
 WRONG = {
     # Bags.
     'replay /no/bag': ['/no/bag', 'does not exist'],
@@ -22,6 +24,11 @@ WRONG = {
     'replay joints -p input_field:=position[3]': ['position[3]', '3 in one message'],
     'replay sqlite -p input_stamp:=source': ['input_stamp source: expected an mcap bag'],
     'replay bag --columns t,y': ['--columns: expected a .csv file, got'],
+    # Tables.
+    f'{TABLE} text.csv': ['text.csv: expected lines of numbers: could not convert str'],
+    f'{TABLE} none.csv': ['--columns: expected 3 titles, of the time, y, torque, got'],
+    f'{TABLE} late.csv --columns t,anlge,u': ["t, angle, u, got 'anlge'; did you mean 'angle'?"],
+    f'{TABLE} late.csv': ['late.csv: expected times of 0 to 9.2e+09 s, got nan in sample 0'],
     # Parameters.
     'replay bag -p input_topic:=/yy': ["'/yy'", '(/y)', "did you mean '/y'?"],
     'replay bag -p input_field:=date': ["'date'", "did you mean 'data'?"],
@@ -34,6 +41,11 @@ WRONG = {
     'plot both -o x.jpg': ['.png, .svg, .pdf', 'x.jpg'],
     'plot both --names /no': ['/estimator', "'/no'"],
     'plot bag': ['topics of an estimator', '/y'],
+    # arm
+    'calibrate --bag joints --payload': ['calibration_file:=FILE'],
+    'calibrate --bag joints': ['one robot on /robot_description', '--robot URDF'],
+    'calibrate --bag joints --robot three.urdf': ['messages on /joint_states, got none'],
+    'calibrate --bag joints --robot three.urdf --topic /y': ['joint states of turn', 'lacks'],
     # play, record, demo
     'play bag --delay -1': ['--delay', '0 to 3600', '-1'],
     'play bag --topics /x': ["'/x'", '/y'],
@@ -47,6 +59,8 @@ WRONG = {
     # tune
     f'{TUNE} -pnoise:=1': ["unknown parameter 'noise'"],
     f'{TUNE} -pweights:=[1.0,2.0]': ['weights', '1 or 4 numbers'],
+    f'{TUNE} -pband_of_d:=[3.0,1.0]': ['band_of_d', 'lower one first'],
+    f'{TUNE} -pphi:=[0,0,z3**3] -prms_of_d:=100.0': ['expected states that stay finite'],
     f'{TUNE} -psettled:=4.0': ['more than 4 s'],
     f'{TUNE} --trials=0': ['--trials >= 1'],
     f'{TUNE} --storage nodb://x': ['storage'],
@@ -76,6 +90,10 @@ def place(tmp_path_factory):
         x = writer.add_connection('/x', files.FLOAT, typestore=files.TYPES)
         writer.write(x, 5, files.float64(1.0))
     files.write(place / 'joints', [('/y', files.JOINTS, 5, files.joint_state(5, [1.0, 2.0, 3.0]))])
+    (place / 'three.urdf').write_text(URDF)
+    (place / 'text.csv').write_text('t,y,u\n0,1,2\n0.001,x,3\n')
+    (place / 'late.csv').write_text('t,angle,u\nnan,1,2\n')
+    (place / 'none.csv').touch()
     (place / 'lamda.yaml').write_text('estimator: {ros__parameters: {lamda: 1.0}}')
     (place / 'node.yaml').write_text('estimater: {ros__parameters: {}}')
     text = shipped('config/demo.yaml').read_text()
@@ -88,6 +106,8 @@ def test_wrong_input_is_said_in_one_line_and_leaves_nothing(call, place, capfd, 
     command, *arguments = shlex.split(call)
     if command in ('demo', 'play', 'record'):
         pytest.importorskip('rclpy', reason='no ROS 2 in this Python')
+    elif command == 'calibrate':
+        pytest.importorskip('pinocchio', reason='pinocchio is not installed (extra: arm)')
     elif '--storage' in arguments:
         pytest.importorskip('optuna', reason='optuna is not installed (extra: tune)')
     monkeypatch.chdir(place)

@@ -3,13 +3,11 @@
 
 import math
 
-from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS, PLANT_NODE_PARAMETERS
 import pytest
 from rcl_interfaces.msg import Parameter, ParameterValue
 from rclpy.parameter import get_parameter_value
 from running import FED
-from test_online_parameters import CHANGES
 
 TABLES = {'estimator': ESTIMATOR_PARAMETERS, 'plant': PLANT_NODE_PARAMETERS}
 STARTED_WITH = {'estimator': FED, 'plant': {'sample_rate': 200.0}}
@@ -28,11 +26,13 @@ def nodes(fed, pair):
 @pytest.mark.parametrize('node', TABLES)
 def test_every_parameter_is_described_and_has_its_default(nodes, node):
     table, parameters = TABLES[node], nodes[node]
-    extra = {n for n in parameters.names() - set(table) if not n.startswith('qos_overrides.')}
+    names = parameters.ask('list_parameters').result.names
+    extra = {name for name in names if not name.startswith('qos_overrides.')} - set(table)
     assert extra <= {'use_sim_time', 'start_type_description_service'}
     assert parameters.all(table) == table.defaults() | STARTED_WITH[node]
     types = [message.type for message in parameters.messages(*table)]
-    for kind, d, p in zip(types, parameters.describe(*table), table.values(), strict=True):
+    described = parameters.ask('describe_parameters', list(table)).descriptors
+    for kind, d, p in zip(types, described, table.values(), strict=True):
         assert d.name == p.name
         assert (d.description, d.type) == (p.text, kind), p.name
         assert d.read_only == (p.name in READ_ONLY[node]), p.name
@@ -43,33 +43,12 @@ def test_every_parameter_is_described_and_has_its_default(nodes, node):
         assert ('set it after cleanup' in d.additional_constraints) == fixed, p.name
 
 
-def test_live_changes_act_on_the_next_sample_as_in_a_replay(fed):
-    replay = OnlineEstimator({'max_gap': FED['max_gap']})
-    for name, (value, *_) in CHANGES.items():
-        if name in ('gamma_max', 'event_deviations'):  # which need others of the base
-            continue
-        was = fed.parameters.all([name])
-        for change in ({name: value}, was):
-            fed.parameters.set(**change)
-            replay.configure(change)
-            for k in range(4):
-                y = 0.2 + 0.01 * math.sin(0.7 * k)
-                replay.update(fed.send(y), y)
-            expected = replay.estimate
-            found = fed.wait_estimate(lambda e: e.stamp == replay.stamp, f'estimate, {name}')
-            assert found.z == list(expected.z), change
-            assert found.innovation == list(expected.innovation), change
-            assert (found.unknown_input, found.gamma) == (expected.unknown_input, expected.gamma)
-        assert fed.parameters.all([name]) == was
-
-
 @pytest.mark.parametrize(('node', 'name', 'value', 'words'), [
     ('estimator', 'gamma_min', 0.97, ['gamma_initial', '0.97']),
     ('estimator', 'variant', 'fuzy', ["'fuzy'", "did you mean 'fuzzy'?"]),
     ('estimator', 'lambda', [15.0, 15.0], ['1 or 4', '[15.0, 15.0]']),
     ('estimator', 'order', 2, ['cleanup', '2']),
     ('estimator', 'epsilon', math.nan, ['expected', 'nan']),
-    ('estimator', 'fuzzy_systems', [True], ['expected', 'True']),
     ('estimator', 'lamda', 1.0, ["did you mean 'lambda'?"]),
     ('plant', 'noise_seed', 1.5, ['an integer', '1.5']),
     ('plant', 'phi', ['0', '0', 'z1'], []),
@@ -85,26 +64,24 @@ def test_bad_value_changes_nothing_and_says_why(nodes, node, name, value, words)
 
 
 def test_a_set_is_judged_as_a_whole(fed):
-    """Each of these would be refused alone, beside the other's old value."""
-    fed.parameters.set(gamma_min=0.85, gamma_max=0.95, gamma_initial=0.9)
-    assert fed.feed(0.2).gamma >= 0.85
+    """The last two would be refused alone, beside the others' old values."""
+    fed.parameters.set(gamma_min=0.01, gamma_initial=0.05, gamma_max=0.06)
+    assert fed.feed(0.2).gamma <= 0.06
 
 
 @pytest.mark.parametrize(('name', 'text', 'value'), [
     ('epsilon', '1e-2', 0.01),
-    ('lambda', '[15, 15, 15, 15]', [15.0] * 4),
     ('lambda', '[15, 1e1, 16.5, 17]', [15.0, 10.0, 16.5, 17.0]),
     ('lambda', '14.5', [14.5]),
     ('start_from_measurement', 'off', False),
-    *(('lambda', text, None) for text in ('[]', '[a, 1]', '[1, 2')),
+    ('lambda', '[a, 1]', None),
 ])  # fmt: skip
 def test_texts_as_ros2_param_set_sends_them(fed, name, text, value):
     p = fed.parameters
     kind = p.messages(name)[0].type
 
     def try_to_set(value: ParameterValue):
-        change = Parameter(name=name, value=value)
-        return fed.user.answer(p.service.set_parameters, [change]).results[0]
+        return p.ask('set_parameters', [Parameter(name=name, value=value)]).results[0]
 
     result = try_to_set(get_parameter_value(text))
     assert result.successful == (value is not None), result.reason
@@ -113,4 +90,4 @@ def test_texts_as_ros2_param_set_sends_them(fed, name, text, value):
     else:
         assert p.get(name) == value
     assert not try_to_set(ParameterValue()).successful  # as `ros2 param delete`
-    assert p.messages(name)[0].type == p.describe(name)[0].type == kind
+    assert p.messages(name)[0].type == kind

@@ -120,7 +120,7 @@ def test_files_and_rules_reach_the_node_for_which_they_are(user, launch, tmp_pat
         'epsilon': ESTIMATOR_PARAMETERS['epsilon'].default,
     }  # fmt: skip
     assert parameters.all(expected) == expected
-    assert 'noise_std' not in parameters.names()
+    assert 'noise_std' not in parameters.ask('list_parameters').result.names
     (line,) = [x for x in process.output().splitlines() if '[WARN]' in x]
     assert line.endswith(f'{files[3]}: sets nothing for node /rig/lead')
 
