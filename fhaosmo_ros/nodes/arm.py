@@ -67,7 +67,7 @@ MEANT = {
     'too strong': 'efforts are a hundred times those of the URDF: what is the unit of effort?',
     'too fast': 'velocities are more than three times the limit of the URDF: are they in degrees?',
     'standing still': 'positions stay the same to the last digit though the arm was moving: is '
-    'the driver stuck, or does it publish faster than it reads?',
+    'the driver stuck?',
     'diverged': 'the estimated velocity became more than three times the limit of the URDF: are '
     'stamps and efforts right? The estimates began anew',
     'clock set back': 'stamps are more than 0.1 s older than before: the estimates began anew',

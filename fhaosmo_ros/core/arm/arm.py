@@ -40,8 +40,8 @@ FURTHER = 0.5
 """rad (m) beyond the URDF's limits, where positions are not believed."""
 FASTER = 3.0
 """Times the URDF's velocity limit: a position that has moved so fast is not believed."""
-ENCODER = 10.0
-"""Standard deviations by which the noise of positions may add to that, however near they are."""
+STEP = 12.0**0.5
+"""Of an encoder, in standard deviations of its error of rounding."""
 STRONGER = 100.0
 """Times the URDF's effort limit, or the torque of the arm's weight: no torque of this arm."""
 STOPPING = 2.0
@@ -202,7 +202,7 @@ class Arm:
         self._variance = position_variance if self._of_position else velocity_variance
         self._samples = Samples(
             noise, np.array([-STRONGER * strong, model.lowest - FURTHER, -fastest]),
-            np.array([STRONGER * strong, model.highest + FURTHER, fastest]), ENCODER * position,
+            np.array([STRONGER * strong, model.highest + FURTHER, fastest]), STEP * position,
             STOPPING * strong, model.continuous, MAX_GAP, self._of_position,
         )  # fmt: skip
         self._bank = Bank(
@@ -333,7 +333,7 @@ class Arm:
         torque, q, velocity = sample
         bank, samples = self._bank, self._samples
         problem = samples.take(time, sample, self._velocity, bank.motion)
-        if problem == 'standing still':
+        if problem in ('standing still', 'repeated'):
             return self._refuse(problem)
         if problem in ('restarts', 'jumped'):
             self.reset()

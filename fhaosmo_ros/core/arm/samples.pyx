@@ -18,6 +18,10 @@ cdef int LEARNT = 20
 cdef double MISSING = 0.7
 # Square of the standard deviations by which joints may miss where their velocity would bring them.
 cdef double STRAIGHT = 100.0
+# Steps of an encoder by which a position may be off, however near samples are.
+cdef double OFF = 3.0
+# A driver may publish what it has read so many times more.
+cdef int MOST_REPEATS = 10
 # Samples over which noise is averaged, at the start and later; an impact counts as three standard
 # deviations at most.
 cdef int FIRST_LEARNT = 10, LONGEST_LEARNT = 1000
@@ -198,8 +202,8 @@ cdef class Samples:
     noise : Noise
     lowest, highest : (3, n) array
         What an arm can have.
-    noisy : (n,) array
-        How far a position may be off, however near samples are.
+    step : (n,) array
+        Of the encoders.
     stopping : (n,) array
         Torques by which no arm is stopped between two samples.
     turning : (n,) array of bool
@@ -216,20 +220,21 @@ cdef class Samples:
     cdef readonly Noise noise
     cdef readonly Clock clock
     cdef double[:, ::1] lowest, highest
-    cdef double[::1] noisy, stopping, rest, position, way, rate
+    cdef double[::1] step, stopping, rest, position, way, rate
     cdef unsigned char[::1] turning
     cdef double longest
     cdef bint of_position, begun, still
+    cdef int repeats  # samples in a row that a driver has published once more
     cdef long long time
 
     def __init__(
-        self, Noise noise, lowest, highest, noisy, stopping, turning, double longest,
+        self, Noise noise, lowest, highest, step, stopping, turning, double longest,
         bint of_position,
     ):
-        n = len(noisy)
+        n = len(step)
         self.noise, self.clock = noise, Clock()
         self.longest, self.of_position = longest, of_position
-        self.lowest, self.highest, self.noisy, self.stopping = lowest, highest, noisy, stopping
+        self.lowest, self.highest, self.step, self.stopping = lowest, highest, step, stopping
         self.turning = np.array(turning, dtype=np.uint8)
         self.rest, self.position = np.zeros(n), np.zeros(n)
         self.way, self.rate = np.zeros(n), np.zeros(n)
@@ -240,12 +245,13 @@ cdef class Samples:
     def reset(self):
         """Take the next sample as the first one."""
         self.begun = self.still = False
+        self.repeats = 0
         self.clock.reset()
         self.noise.reset()
 
     def fault(self, const double[:, ::1] sample):
         """Return the first row with a number that no arm can have, -1 if there is none."""
-        cdef int i, k, n = self.noisy.shape[0]
+        cdef int i, k, n = self.step.shape[0]
         if sample.shape[0] != 3 or sample.shape[1] != n:
             raise ValueError(f'expected a sample of shape {(3, n)}')
         for i in range(3):
@@ -257,7 +263,7 @@ cdef class Samples:
     def is_possible(self, const double[::1] velocity):
         """Return False where a joint, of (n,), is faster than any, or not finite."""
         cdef int k
-        cdef bint possible = velocity.shape[0] == self.noisy.shape[0]
+        cdef bint possible = velocity.shape[0] == self.step.shape[0]
         for k in range(velocity.shape[0] if possible else 0):
             possible = possible and fabs(velocity[k]) < self.highest[2, k]
         return possible
@@ -290,13 +296,14 @@ cdef class Samples:
         -------
         str
             Empty if the sample can be used; 'first' if there was none before it; 'standing still',
-            'restarts' (after a gap) and 'jumped' if it is not used.
+            'repeated' (a joint that moves by more than a step of its encoder shows it), 'restarts'
+            (after a gap) and 'jumped' if it is not used.
 
         """
         cdef const double[::1] known = self.rest if velocity is None else velocity
-        cdef int k, n = self.noisy.shape[0]
+        cdef int k, n = self.step.shape[0]
         cdef double over  # what divides `motion` to have p
-        cdef bint moves = False
+        cdef bint moves = False, repeated = False
         if sample.shape[0] != 3 or not (
             n == sample.shape[1] == known.shape[0] == motion.shape[0]
         ):
@@ -310,17 +317,21 @@ cdef class Samples:
             self.way[k] = self.shorter(k, sample[1, k] - self.position[k])
             moves = moves or self.way[k] != 0.0
         if moves:
-            self.still = False
-        elif not self.still and velocity is not None:  # to the bit, and all joints at once
+            self.still, self.repeats = False, 0
+        elif velocity is not None:  # to the bit, and all joints at once
             for k in range(n):
+                repeated = repeated or fabs(known[k]) * self.h > self.step[k]
                 self.still = self.still or fabs(motion[k]) > self.stopping[k] * self.h * over
+        if repeated and self.repeats < MOST_REPEATS:
+            self.repeats += 1
+            return 'repeated'
         if self.still:
             return 'standing still'
         if self.h > self.longest:
             return 'restarts'
         self.h = self.clock.interval(self.h, self.way, known, self.noise.now[1])
         for k in range(n):
-            if fabs(self.way[k]) > self.highest[2, k] * self.h + self.noisy[k]:
+            if fabs(self.way[k]) > self.highest[2, k] * self.h + OFF * self.step[k]:
                 return 'jumped'
             self.rate[k] = self.way[k] / self.h if self.of_position else sample[2, k]
         self.vague = self.clock.vague if self.of_position else 0.0
@@ -332,5 +343,5 @@ cdef class Samples:
         """Remember a sample."""
         cdef int k
         self.begun, self.time = True, time
-        for k in range(self.noisy.shape[0]):
+        for k in range(self.step.shape[0]):
             self.position[k] = sample[1, k]
