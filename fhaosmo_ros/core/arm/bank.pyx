@@ -352,18 +352,19 @@ cdef class Bank:
         as they are, are the largest by far.
         """
         cdef Py_ssize_t j, i, k, n = self.joints, best = 0
-        cdef double off
+        cdef double* off = &self.off[2 * n]
         self.average[:] = 0.0
         for j in range(self.filters):
-            best = j if self.w[j] > self.w[best] else best
             for k in range(3 * n):
                 self.average[k] += self.w[j] * self.x[j, k]
+        for j in range(self.filters):
+            if self.w[j] > self.w[best]:
+                best = j
         for i in range(n):
-            off = self.x[best, 2 * n + i] - self.average[2 * n + i]
+            off[i] = self.x[best, 2 * n + i] - self.average[2 * n + i]
+        for i in range(n):
             for k in range(n):
-                self.spread[i, k] = self.p[best, 2 * n + i, 2 * n + k] + off * (
-                    self.x[best, 2 * n + k] - self.average[2 * n + k]
-                )
+                self.spread[i, k] = self.p[best, 2 * n + i, 2 * n + k] + off[i] * off[k]
 
 
 cdef inline void add(
