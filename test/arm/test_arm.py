@@ -127,6 +127,19 @@ def test_a_force_that_is_there_at_once_is_not_taken_for_one_that_grows():
 
 
 @pytest.mark.parametrize('measurement', ['position', 'velocity'])
+def test_two_thirds_of_the_errors_in_contact_are_within_a_standard_deviation(free, measurement):
+    t, q, v, torque = free
+    random = np.random.default_rng(10)
+    noise = 1e-4 * random.standard_normal(v.shape), 0.3 * random.standard_normal(v.shape)
+    push = np.sin(np.pi * np.clip((t - 1.0) / 2.0, 0.0, 1.0))[:, np.newaxis] ** 2 * [3.0, -4.0, 0]
+    arm = Arm(URDF, measurement=measurement, velocity_noise=[1e-4])
+    found = arm.run(t, q, torque - push + noise[1], v + noise[0])
+    away = (np.abs(found.external_torque - push) / found.standard_deviation)[1100:2900]
+    assert 0.6 < np.mean(away < 1.0) < 0.76
+    assert 0.9 < np.mean(away < 1.96) < 0.98
+
+
+@pytest.mark.parametrize('measurement', ['position', 'velocity'])
 def test_a_push_is_found_told_and_located(free, measurement):
     arm = Arm(URDF, measurement=measurement, velocity_noise=[1e-4])
     pushed = np.zeros((4000, 3))

@@ -48,7 +48,7 @@ cdef class Bank:
     cdef readonly double log_odds  # of contact against free motion
     cdef readonly object motion  # (n,): M times `change` of the latest step
     cdef readonly object mean  # (3, n): Y less what was measured, p and d
-    cdef readonly object covariance  # (n, n) of d, if the likelier of both is right
+    cdef readonly object covariance  # (n, n) of d, if the likeliest filter is right
     cdef readonly object weights  # (m + 1,), the first of free motion
     cdef double decay, begin, end, change, onset, since
     cdef double[::1] free, scales, w, mixed, begun, likelihood, average
@@ -346,27 +346,25 @@ cdef class Bank:
 
     cdef VECTORISED combine(self) noexcept nogil:
         """
-        Write the mean over all filters, and the covariance of d.
+        Write the mean over all filters, and the covariance of d about it by the likeliest one.
 
-        The covariance is that of the likelier of free motion and contact: the other one, however
-        unlikely, would make a band of two thirds as wide as a force that is not there.
+        That of all filters is mostly that of the others, however unlikely: their errors, seldom
+        as they are, are the largest by far.
         """
-        cdef Py_ssize_t j, i, k, n = self.joints
-        cdef bint free = self.w[0] > 0.5
-        cdef double off, share, all_of_them = self.w[0] if free else 1.0 - self.w[0]
+        cdef Py_ssize_t j, i, k, n = self.joints, best = 0
+        cdef double* off = &self.off[2 * n]
         self.average[:] = 0.0
         for j in range(self.filters):
             for k in range(3 * n):
                 self.average[k] += self.w[j] * self.x[j, k]
-        self.spread[:, :] = 0.0
-        for j in range(0 if free else 1, 1 if free else self.filters):
-            share = self.w[j] / all_of_them
-            for i in range(2 * n, 3 * n):
-                off = self.x[j, i] - self.average[i]
-                for k in range(2 * n, 3 * n):
-                    self.spread[i - 2 * n, k - 2 * n] += share * (
-                        self.p[j, i, k] + off * (self.x[j, k] - self.average[k])
-                    )
+        for j in range(self.filters):
+            if self.w[j] > self.w[best]:
+                best = j
+        for i in range(n):
+            off[i] = self.x[best, 2 * n + i] - self.average[2 * n + i]
+        for i in range(n):
+            for k in range(n):
+                self.spread[i, k] = self.p[best, 2 * n + i, 2 * n + k] + off[i] * off[k]
 
 
 cdef inline void add(
