@@ -10,7 +10,6 @@ from fhaosmo_ros.core.arm.identification import identify
 from fhaosmo_ros.core.arm.model import ArmModel
 from fhaosmo_ros.tools.tuning.search import minimise, Values
 import numpy as np
-from numpy.typing import NDArray
 from studies.arm.peers import momentum, PEERS
 from studies.arm.world import rmse, ROBOTS, SETTLED, simulate, Touched, UNSEEN, urdf_of
 from studies.evidence import markdown, Row
@@ -83,10 +82,15 @@ def judged(robot: str, by_position: bool, duration: float, quick: bool) -> list[
                 found[situation].append((w, e.external_torque, e.log_odds))
                 if situation == 'pushes':
                     away = np.abs(e.external_torque - w.truth) / e.standard_deviation
-                    touched = np.any(w.truth != 0.0, axis=1)
-                    within.append(np.column_stack([touched, away])[w.t > SETTLED])
-        touched, away = np.split(np.concatenate(within), [1], axis=1)
-        rows.append({'observer': name, **_row(found), **_shares(away, touched[:, 0] > 0.0)})
+                    touched, late = np.any(w.truth != 0.0, axis=1), w.t > SETTLED
+                    within.append((away[late], touched[late]))
+        away, touched = map(np.concatenate, zip(*within, strict=True))
+        parts = ('', touched | ~touched), (' in contact', touched), (' in free motion', ~touched)
+        shares = {
+            f'within {k}{where}': float(np.mean(away[part] < k))
+            for where, part in parts for k in BANDS
+        }  # fmt: skip
+        rows.append({'observer': name, **_row(found), **shares})
     columns = dict.fromkeys(key for r in reversed(rows) for key in r)
     return [{column: r.get(column) for column in columns} for r in rows]
 
@@ -108,16 +112,6 @@ def _row(found: dict[str, Group]) -> Row:
     row['delay'], row['delay p90'] = (float(np.quantile(delays, s)) for s in (0.5, 0.9))
     row['overshoot'] = float(np.median(beyond)) if beyond else np.nan
     return row
-
-
-def _shares(away: Floats, touched: NDArray[np.bool_]) -> Row:
-    """Return the shares of errors within so many standard deviations: of all, and by contact."""
-    parts = {'': touched | ~touched, ' in contact': touched, ' in free motion': ~touched}
-    return {
-        f'within {k}{name}': float(np.mean(away[part] < k))
-        for name, part in parts.items()
-        for k in BANDS
-    }
 
 
 def measure(arguments: argparse.Namespace, results: Results) -> Found:
@@ -149,14 +143,8 @@ def measure(arguments: argparse.Namespace, results: Results) -> Found:
                 ),
             ])  # fmt: skip
     errors = (f'{s}, RMSE' for s in SITUATIONS)
-    head = (
-        'measured',
-        'observer',
-        *errors,
-        'delay, 90 %, ms',
-        'overshoot, %',
-        'within 1, 1.96 deviations, %',
-    )
+    ends = 'delay, 90 %, ms', 'overshoot, %', 'within 1, 1.96 deviations, %'
+    head = ('measured', 'observer', *errors, *ends)
     return Found({'arm': rows}, {'arm': markdown(head, lines)}, {})
 
 
