@@ -91,7 +91,7 @@ cdef class SelfTuning(Structure):
         """Go back to the state before any sample."""
         cdef int i
         Structure.reset(self)
-        memset(&self.members.shared, 0, sizeof(Shared))
+        self.begin_afresh()
         memset(&self.model, 0, sizeof(self.model))
         self.y_jumped = False
         for i in range(self.levels):
@@ -103,7 +103,8 @@ cdef class SelfTuning(Structure):
 
     cdef void begin_afresh(self) noexcept nogil:
         """Let the members begin afresh, by the next samples."""
-        self.members.shared.samples = 0
+        memset(&self.members.shared, 0, sizeof(Shared))
+        self.memory.beyond = 0.0
 
     cdef void fail(self, double y) noexcept nogil:
         """Let the members begin afresh after a step that has left the finite numbers."""
