@@ -24,9 +24,9 @@ cdef double CLIPPED = 1.0 - HUBER * sqrt(M_2_PI) * exp(-0.5 * HUBER * HUBER) / e
 # than the one that is told. After so many time constants of a member its P is steady.
 cdef double FADED = 8.0
 cdef double SHORT_SHARE = 1.0 / LOST_SAMPLES  # of the last sample in short means
-# If squared innovations over S are larger of late for every member that can judge, and squared
-# differences of y are too, the noise has grown. It is averaged over QUICK_SAMPLES then, as are the
-# steps of y.
+# If squared innovations over S are so much larger of late for every member that can judge, and
+# squared differences of y are too, the noise has grown: it is averaged over QUICK_SAMPLES then, as
+# are the steps of y. P is not the steady one if noise or the mean interval has changed so much.
 cdef double STEADY = 1.5, QUICK_SAMPLES = 40.0
 # With a larger share of multiples of the quantum among the steps of y it is quantised.
 cdef double LATTICE_SHARE = 0.9
