@@ -8,7 +8,7 @@ larger by orders of magnitude. So the innovations of the member that was likely 
 mean (Willsky and Jones 1976).
 """
 
-from libc.math cimport fabs, fmax, fmin, log, pow, sqrt
+from libc.math cimport INFINITY, fabs, fmax, fmin, log, pow, sqrt
 from libc.string cimport memcpy, memset
 
 from fhaosmo_ros.core.observer.self_tuning.filters cimport HUBER
@@ -20,10 +20,10 @@ from fhaosmo_ros.core.observer.self_tuning.noise cimport FADED, ROUGH
 from fhaosmo_ros.core.observer.structure cimport GATE, LOST_SAMPLES
 
 # Where unlikely samples are farther off than the first one, d may have jumped (D 33). Farther
-# means: so many times as far, and 3 sigma more; and HUBER times the highest differences of y, as
-# noise is not. Differences must not have been larger than usual before, unless y is farther off by
-# the last factor.
-cdef double FARTHER = 1.3, SMOOTHEST = 30.0
+# means: so many times as far, and 3 sigma more; and so many times the highest differences of y,
+# which noise does not get to. Differences must not have been larger than usual before, unless y is
+# farther off by the last factor.
+cdef double FARTHER = 1.3, SMOOTH = 5.0, SMOOTHEST = 30.0
 # From one usual value to the opposite one d jumps by so many times its usual size.
 cdef double USUAL_JUMP = 2.0
 
@@ -51,7 +51,7 @@ cdef bint has_jumped(Members* m, double beyond) noexcept nogil:
         begin_growth(m)
     shared.uneven += (sample.uneven - shared.uneven) / (count + 1.0)
     uneven = sqrt(shared.uneven)
-    if count > 0 and off > HUBER * uneven and (
+    if count > 0 and off > SMOOTH * uneven and (
         off > FARTHER * shared.first_off + HUBER * sqrt(m.work.now[0])
     ):
         shared.growing += 1.0
@@ -102,7 +102,7 @@ cdef void follow_innovations(Members* m) noexcept nogil:
 cdef int samples_since_jump(Members* m) noexcept nogil:
     """Return for how many samples y has been off by a constant (D 35); 0 if it is not."""
     cdef Shared* shared = &m.shared
-    cdef double best = 0.0, total = 0.0, gained, most = 0.0
+    cdef double best = 0.0, total = 0.0, gained, most = 0.0, coloured = -INFINITY
     cdef double* before
     cdef int first = 0, g, j, count
     for j in range(WINDOW - 1, -1, -1):
@@ -117,13 +117,17 @@ cdef int samples_since_jump(Members* m) noexcept nogil:
     g = shared.followed
     if best <= GATE * GATE or first < WINDOW // 2 or GRID.bandwidth[g] * WINDOW > 1.0:
         return 0
-    if best <= otherwise(m.window, m.n) + 2.0 * FADED:
+    if shared.since_mark < WINDOW:  # too soon after a jump: rather d explains both
+        return 0
+    if best <= otherwise(m.window, m.n) + FADED:
         return 0
     before = &m.score_before[0 if shared.since_mark % WINDOW >= count else 1][0]
     gained = m.score[g] - before[g]
     for j in range(HALF):
         most = fmax(most, 2.0 * (m.score[j] - before[j] - gained))
-    return count if best > most + 2.0 * FADED else 0
+    for j in range(HALF, COUNT):
+        coloured = fmax(coloured, 2.0 * (before[j] - before[g]))
+    return count if best > most + FADED and coloured < -FADED else 0
 
 
 cdef double otherwise(const double* r, int n) noexcept nogil:

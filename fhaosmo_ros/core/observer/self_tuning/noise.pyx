@@ -20,8 +20,9 @@ cdef double CLIPPED = 1.0 - HUBER * sqrt(M_2_PI) * exp(-0.5 * HUBER * HUBER) / e
 )
 # The exponential of minus this is nothing. Members whose log-likelihood is so far below the best
 # one do not say whether a sample is likely, and those so far below the best one of their colour do
-# not tell the noise. A jump of y has to be so much likelier than anything else, and another model
-# than the one that is told. After so many time constants of a member its P is steady.
+# not tell the noise. In twice the log-likelihood, a jump of y has to be so much likelier than
+# anything else, and another model than the one that is told. After so many time constants of a
+# member its P is steady.
 cdef double FADED = 8.0
 cdef double SHORT_SHARE = 1.0 / LOST_SAMPLES  # of the last sample in short means
 # If squared innovations over S are so much larger of late for every member that can judge, and

@@ -80,7 +80,7 @@ cdef void tell_model(Members* m, double slider, bint jumped, Model* model) noexc
     cdef Shared* shared = &m.shared
     cdef int g, k
     cdef double noise, a, twice, edge, h = m.work.sample.h
-    if m.score[shared.told] < -FADED:
+    if 2.0 * m.score[shared.told] < -FADED:
         shared.told = shared.likeliest
     g = shared.told
     k, noise, a = GRID.order[g], m.work.now[GRID.colour[g]], m.correlation[g]
