@@ -143,7 +143,7 @@ def sizes_of(y: Floats, n: int, period: float) -> Floats:
     found = []
     for _ in range(1, n):
         y = (y[stride:] - y[:-stride]) / (stride * period)
-        found.append(100.0 * np.sort(y**2)[int(0.8 * len(y))])
+        found.append(100.0 * np.mean(y**2))
     return np.array(found)
 
 

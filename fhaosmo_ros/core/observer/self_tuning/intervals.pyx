@@ -21,14 +21,15 @@ from fhaosmo_ros.core.observer.structure cimport GATE
 
 cdef double ROOT = sqrt(2.0 * M_PI)
 cdef double FARTHEST = 12.0  # standard deviations; numbers that are farther off count as so far
-# Part of the quantum by which predictions of z_1 are less certain than their P says.
+# Part of the quantum by which predictions of z_1 are less certain than their P says. In an
+# interval of twice so few standard deviations the density is taken to be constant.
 cdef double VAGUE = 0.1
-# Logarithms of the least probability that a sample counts with, and of the least one with which
-# z_1 passes an edge at just this sample.
-cdef double LEAST_CHANCE = -6.0, LEAST_PASSAGE = 2.0 * LEAST_CHANCE
 # If more than one in so many of y's steps go back at once, noise of as much as VAGUE carries z_1
 # over edges. Innovations do not show noise that is far smaller than the quantum.
 cdef double OF_BACK = 3.0
+# Logarithms of the least probability that a sample counts with, by HUBER as without quanta, and of
+# the least one with which z_1 passes an edge at just this sample.
+cdef double LEAST_CHANCE = -0.5 * HUBER * HUBER, LEAST_PASSAGE = 2.0 * LEAST_CHANCE
 # That probability is so small that it has to be found from the speed if z_1 moves, squared, by
 # less than this part of its variance.
 cdef double SLOW = 0.25
@@ -38,8 +39,6 @@ cdef double HALF_SURE = log(0.5)
 # first probability. So a sample that repeats the one before, and that a member expects with more
 # than the second one, tells it nothing: each such sample would narrow it again.
 cdef double EVENLY = log(erf(sqrt(1.5))), KNOWN = log(0.88)
-# In an interval of twice so few standard deviations the density is taken to be constant.
-cdef double HALF_NARROW = 0.015
 
 
 cdef VECTORISED truncate(Members* m, double half, double least, bint repeated) noexcept nogil:
@@ -74,16 +73,16 @@ cdef VECTORISED truncate(Members* m, double half, double least, bint repeated) n
         # one that has both its edges beyond it is certain.
         share = share if near > -tail else ROOT
         share = share if near < tail else ROOT
-        share = share if width > HALF_NARROW else 2.0 * width
+        share = share if width > VAGUE else 2.0 * width
         w.chance[g] = share / ROOT
         square = near * near if near > tail else 0.0
-        w.one[g] = square if width > HALF_NARROW else off * off
+        w.one[g] = square if width > VAGUE else off * off
         center = center if near < tail else near + by_near
-        center = center if width > HALF_NARROW else off
+        center = center if width > VAGUE else off
         center = copysign(center, w.b[g])
         w.mean[g] = center if near > -tail else 0.0
         less = less if near < tail else 1.0 - by_near * by_near
-        less = less if width > HALF_NARROW else 1.0 - width * width / 3.0
+        less = less if width > VAGUE else 1.0 - width * width / 3.0
         less = less if less > 0.0 else 0.0
         less = less if less < 1.0 else 1.0
         w.lost[g] = less if near > -tail else 0.0

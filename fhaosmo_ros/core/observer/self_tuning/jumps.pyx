@@ -16,7 +16,7 @@ from fhaosmo_ros.core.observer.self_tuning.members cimport (
     COUNT, GRID, HALF, Line, MOST_STATES, Members, ORDERS, Sample, Shared, WINDOW,
     by_binomials, factorial, power, put, state
 )
-from fhaosmo_ros.core.observer.self_tuning.noise cimport ROUGH
+from fhaosmo_ros.core.observer.self_tuning.noise cimport FADED, ROUGH
 from fhaosmo_ros.core.observer.structure cimport GATE, LOST_SAMPLES
 
 # Where unlikely samples are farther off than the first one, d may have jumped (D 33). Farther
@@ -26,12 +26,6 @@ from fhaosmo_ros.core.observer.structure cimport GATE, LOST_SAMPLES
 cdef double FARTHER = 1.3, SMOOTH = 5.0, SMOOTHEST = 30.0
 # From one usual value to the opposite one d jumps by so many times its usual size.
 cdef double USUAL_JUMP = 2.0
-# A jump is taken to have begun while y was off by at most this part of what it is off now.
-cdef double HIDDEN_MOST = 0.9
-# By so much, in twice the log-likelihood, a jump has to explain the innovations better than
-# growing ones or more noise, and than any other member; and white noise to be likelier than
-# coloured noise.
-cdef double SHAPE = 2.0, BELIEVED = 8.0
 
 
 cdef void begin_growth(Members* m) noexcept nogil:
@@ -67,7 +61,8 @@ cdef bint has_jumped(Members* m, double beyond) noexcept nogil:
         shared.first_rough >= ROUGH and off <= SMOOTHEST * uneven
     ):
         return False
-    hidden = fmin(GATE * sqrt(m.work.now[0]) / off, HIDDEN_MOST)
+    # So far off y may have been when the jump began.
+    hidden = fmin(GATE * sqrt(m.work.now[0]), shared.first_off) / off
     sample.since_jump = sample.h / (1.0 - pow(hidden, 1.0 / m.n))
     jump = off * factorial(m.n) / power(sample.since_jump, m.n)
     jump = log(jump / (USUAL_JUMP * sqrt(shared.size_of_d)))
@@ -124,7 +119,7 @@ cdef int samples_since_jump(Members* m) noexcept nogil:
         return 0
     if shared.since_mark < WINDOW:  # too soon after a jump: rather d explains both
         return 0
-    if best <= otherwise(m.window, m.n) + SHAPE:
+    if best <= otherwise(m.window, m.n) + FADED:
         return 0
     before = &m.score_before[0 if shared.since_mark % WINDOW >= count else 1][0]
     gained = m.score[g] - before[g]
@@ -132,24 +127,18 @@ cdef int samples_since_jump(Members* m) noexcept nogil:
         most = fmax(most, 2.0 * (m.score[j] - before[j] - gained))
     for j in range(HALF, COUNT):
         coloured = fmax(coloured, 2.0 * (before[j] - before[g]))
-    return count if best > most + BELIEVED and coloured < -BELIEVED else 0
+    return count if best > most + FADED and coloured < -FADED else 0
 
 
 cdef double otherwise(const double* r, int n) noexcept nogil:
     """
     Return how well anything but a jump explains innovations: twice the gain of log-likelihood.
 
-    A line through all of the window; powers, up to n, of the time since any sample of it, as a d
-    that has jumped gives them; and noise that has grown since any sample.
+    Powers, up to n, of the time since any sample of the window, as a d that has jumped gives them;
+    and noise that has grown since any sample.
     """
-    cdef double middle = 0.5 * (WINDOW - 1), level = 0.0, slope = 0.0, size = 0.0, squares = 0.0
-    cdef double most, along, shape
+    cdef double most = 0.0, squares = 0.0, along, shape, size
     cdef int j, m, count, degree
-    for j in range(WINDOW):
-        level += r[j]
-        slope += (j - middle) * r[j]
-        size += (j - middle) * (j - middle)
-    most = level * level / WINDOW + slope * slope / size
     for m in range(WINDOW - 1, -1, -1):
         count = WINDOW - m
         squares += r[m] * r[m]

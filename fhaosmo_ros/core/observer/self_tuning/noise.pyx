@@ -11,7 +11,7 @@ from fhaosmo_ros.core.vectors cimport VECTORISED
 from fhaosmo_ros.core.observer.structure cimport LOST_SAMPLES
 
 # Variances of which one is so many times the other are different ones: who expects S of so many
-# times the smallest one does not judge y.
+# times the smallest one does not judge y, and noise of so many times that of rounding hides it.
 cdef double APART = 3.0
 # Mean of x^2 within HUBER where x is normal with variance 1: 2 % less than that of squares bounded
 # so, for the noise is rather found too large.
@@ -20,16 +20,17 @@ cdef double CLIPPED = 1.0 - HUBER * sqrt(M_2_PI) * exp(-0.5 * HUBER * HUBER) / e
 )
 # The exponential of minus this is nothing. Members whose log-likelihood is so far below the best
 # one do not say whether a sample is likely, and those so far below the best one of their colour do
-# not tell the noise. After so many time constants of a member its P is steady.
+# not tell the noise. In twice the log-likelihood, a jump of y has to be so much likelier than
+# anything else, and another model than the one that is told. After so many time constants of a
+# member its P is steady.
 cdef double FADED = 8.0
 cdef double SHORT_SHARE = 1.0 / LOST_SAMPLES  # of the last sample in short means
-# If squared innovations over S are larger of late for every member that can judge, and squared
-# differences of y are too, the noise has grown. It is averaged over QUICK_SAMPLES then, as are the
-# steps of y.
+# If squared innovations over S are so much larger of late for every member that can judge, and
+# squared differences of y are too, the noise has grown: it is averaged over QUICK_SAMPLES then, as
+# are the steps of y. P is not the steady one if noise or the mean interval has changed so much.
 cdef double STEADY = 1.5, QUICK_SAMPLES = 40.0
 # With a larger share of multiples of the quantum among the steps of y it is quantised.
 cdef double LATTICE_SHARE = 0.9
-cdef double HIDDEN = 4.0  # noise of so many times the variance of rounding hides the quanta
 cdef double ROUGH_SAMPLES = 100.0  # squared differences of y are averaged over so many
 # Where intervals are uneven by more than this part of the period, so are the stamps: a host stamps
 # a sample some microseconds late, by a little more or less for dozens of samples, and a y that is
@@ -85,7 +86,7 @@ cdef void follow_quantum(Members* m) noexcept nogil:
 cdef double rounding(Members* m) noexcept nogil:
     """Return the variance of the error of rounding; 0 if y is not quantised, or noise hides it."""
     cdef double quanta = m.shared.quantum * m.shared.quantum / 12.0
-    cdef bint hidden = HIDDEN * quanta < m.noise[0]
+    cdef bint hidden = APART * quanta < m.noise[0]
     return 0.0 if hidden or m.shared.lattice < LATTICE_SHARE else quanta
 
 

@@ -38,11 +38,8 @@ cdef double MEMORY = 8000.0
 cdef double NOISE_SAMPLES = 1000.0  # the noise is averaged over so many
 # What is beyond 3 sigma in so many samples after a jump of d is due to it, too.
 cdef double JUMP_SAMPLES = 10.0
-# Intervals that differ by this part are equal: seconds of a clock, as floats, are not exact.
-cdef double SAME = 1e-9
-# P is not the steady one if the mean interval has changed by more than the first part of it, nor
-# after an interval of GAP usual ones; after shorter ones nearly.
-cdef double NEAR = 0.25, GAP = 2.5
+# P is not the steady one after an interval of so many usual ones; after shorter ones nearly.
+cdef double GAP = 2.5
 # Covariances of so many members, or of a multiple, move: whole vectors of the processor.
 cdef int EVEN = 16
 # A y has noise if its differences are all more than this part of its first difference, and of the
@@ -91,7 +88,7 @@ cdef class SelfTuning(Structure):
         """Go back to the state before any sample."""
         cdef int i
         Structure.reset(self)
-        memset(&self.members.shared, 0, sizeof(Shared))
+        self.begin_afresh()
         memset(&self.model, 0, sizeof(self.model))
         self.y_jumped = False
         for i in range(self.levels):
@@ -103,7 +100,8 @@ cdef class SelfTuning(Structure):
 
     cdef void begin_afresh(self) noexcept nogil:
         """Let the members begin afresh, by the next samples."""
-        self.members.shared.samples = 0
+        memset(&self.members.shared, 0, sizeof(Shared))
+        self.memory.beyond = 0.0
 
     cdef void fail(self, double y) noexcept nogil:
         """Let the members begin afresh after a step that has left the finite numbers."""
@@ -229,7 +227,7 @@ cdef class SelfTuning(Structure):
             weigh(m, FLOOR)
         follow_differences(m, y)
         follow_stamps(m, h, memory.beyond > 0.0)
-        same = fabs(h - shared.flow_period) <= SAME * shared.flow_period
+        same = fabs(h - shared.flow_period) <= EXACT * shared.flow_period
         self.carry_flow(h, u, same)
         speed = (self.prediction.z[0] - self.trial[0].z_hat) / h
         shared.of_stamps = shared.jitter * speed * speed
@@ -314,10 +312,8 @@ cdef class SelfTuning(Structure):
             for g in range(HALF, COUNT):
                 m.decayed[g] = m.decayed[GRID.white[g]]
                 m.correlation[g] = of_colours[GRID.colour[g]]
-        changed = (
-            fabs(mean - shared.steady_period) > NEAR * shared.steady_period
-            or h > GAP * shared.steady_period
-        )
+        ratio = mean / shared.steady_period
+        changed = not 1.0 / STEADY < ratio < STEADY or h > GAP * shared.steady_period
         for c in range(COLOURS):
             ratio = m.work.now[c] / m.used_noise[c]
             limit = STEADY if c == GRID.colour[shared.likeliest] else APART

@@ -17,65 +17,35 @@ from fhaosmo_ros.core.observer.self_tuning.weights cimport FLOOR, weigh
 
 cdef double LEAST = 1e-150  # noise: its square is not 0
 cdef double MEDIAN = 0.6745  # of |x| where x is normal with variance 1
-# Share of the first samples' differences that say how large z may be; others may be outliers.
-cdef double MOST = 0.8
 # States may be so many times as large: a start that is too sure of them costs more than one that
 # is not sure enough.
 cdef double DOUBT = 10.0
-# y may be constant until its sensor is ready. So many samples from its first change on tell
-# whether it is quantised; if not, the first samples are those from there on.
-cdef int CHANGING = 8
-# If a larger share of the first samples repeat the one before, y is quantised.
-cdef double REPEATED = 0.3
 
 
 cdef void gather(Members* m) noexcept nogil:
-    """Collect the first samples; once there are enough, let the members begin (D 28)."""
+    """
+    Collect the first samples; once there are enough, let the members begin (D 28).
+
+    y may be constant until its sensor is ready: then the last constant one is the first of them.
+    """
     cdef Shared* shared = &m.shared
-    cdef double largest = 0.0
-    cdef int count = shared.samples, changed = 1, since, i
-    if count == 0:
+    cdef double y = m.work.sample.y, largest = 0.0
+    cdef int count = max(shared.samples, 1), i
+    if count == 1:
         m.first_y[0], m.first_h[0] = m.work.sample.before, 0.0
-        count = 1
-    if count == FIRST_SAMPLES:  # y had not changed by then
-        drop_first(m, 1, count)
-        count -= 1
-    m.first_y[count], m.first_h[count] = m.work.sample.y, m.work.sample.h
-    shared.samples = count = count + 1
+    if count > 1 or fabs(y - m.first_y[0]) > ROUNDED * fabs(y):
+        m.first_y[count], m.first_h[count] = y, m.work.sample.h
+        count += 1
+    shared.samples = count
     if count < FIRST_SAMPLES:
         return
     for i in range(count):
         largest = fmax(largest, fabs(m.first_y[i]))
-    # Number of the first sample that is another one.
-    while changed < count and fabs(m.first_y[changed] - m.first_y[0]) <= ROUNDED * largest:
-        changed += 1
-    since = count - changed
-    if changed > 1 and not (
-        since >= CHANGING and on_lattice(m.first_y + count - CHANGING - 1)
-    ):
-        if since >= CHANGING:
-            drop_first(m, changed - 1, count)
-            shared.samples = since + 1
-        return
     begin(m, find_noise(m, fmax(1e-9 * largest, LEAST), largest))
     shared.samples = FIRST_SAMPLES + 1
 
 
-cdef void drop_first(Members* m, int dropped, int count) noexcept nogil:
-    """Drop the first ones of `count` samples."""
-    cdef int i
-    for i in range(count - dropped):
-        m.first_y[i], m.first_h[i] = m.first_y[i + dropped], m.first_h[i + dropped]
-
-
-cdef bint on_lattice(const double* values) noexcept nogil:
-    """Return True if `CHANGING` steps seem to be those of a quantised y."""
-    return share_of_multiples(
-        values, CHANGING + 1, find_quantum(values, CHANGING + 1, 0.0)
-    ) > LATTICE_SHARE
-
-
-cdef double find_quantum(const double* values, int count, double least) noexcept nogil:
+cdef double find_quantum(const double* values, double least) noexcept nogil:
     """
     Return the smallest step above `least`; INFINITY if none is.
 
@@ -83,32 +53,30 @@ cdef double find_quantum(const double* values, int count, double least) noexcept
     """
     cdef double quantum = INFINITY, step
     cdef int i
-    for i in range(1, count):
+    for i in range(1, FIRST_SAMPLES):
         step = fabs(values[i] - values[i - 1])
         if step > least:
             quantum = fmin(quantum, step)
-    for i in range(1, count):
-        if share_of_multiples(values, count, quantum) < LATTICE_SHARE:
+    for i in range(1, FIRST_SAMPLES):
+        if share_of_multiples(values, quantum) < LATTICE_SHARE:
             quantum = divided(quantum, fabs(values[i] - values[i - 1]), values[i])
     return quantum
 
 
-cdef double share_of_multiples(const double* values, int count, double quantum) noexcept nogil:
+cdef double share_of_multiples(const double* values, double quantum) noexcept nogil:
     """Return the share of multiples of `quantum` among the steps; 1 if many samples repeat."""
-    cdef double steps = 0.0, repeated = 0.0, multiples = 0.0, step
+    cdef double steps = 0.0, multiples = 0.0, step
     cdef int i
-    for i in range(1, count):
+    for i in range(1, FIRST_SAMPLES):
         step = fabs(values[i] - values[i - 1])
-        if step < 0.99 * quantum:
-            repeated += 1.0
-        else:
+        if step >= 0.99 * quantum:
             steps += 1.0
             multiples += is_multiple(step, quantum, values[i])
-    return 1.0 if repeated > REPEATED * (count - 1) else multiples / steps
+    return multiples / steps if steps > LATTICE_SHARE * (FIRST_SAMPLES - 1) else 1.0
 
 
-cdef double ranked(double* values, int count, double share) noexcept nogil:
-    """Return the value that a share of `count` ones is below; sorts these in place."""
+cdef double median(double* values, int count) noexcept nogil:
+    """Return the median of `count` values; sorts these in place."""
     cdef double value
     cdef int i, j
     for i in range(1, count):
@@ -117,7 +85,7 @@ cdef double ranked(double* values, int count, double share) noexcept nogil:
             values[j] = values[j - 1]
             j -= 1
         values[j] = value
-    return values[<int>(share * count)]
+    return values[count // 2]
 
 
 cdef double find_noise(Members* m, double least, double largest) noexcept nogil:
@@ -131,33 +99,33 @@ cdef double find_noise(Members* m, double least, double largest) noexcept nogil:
     cdef double differences[FIRST_SAMPLES]
     cdef double values[FIRST_SAMPLES]
     cdef double rough[DIFFERENCES]
-    cdef double quantum = find_quantum(m.first_y, shared.samples, ROUNDED * largest)
+    cdef double quantum = find_quantum(m.first_y, ROUNDED * largest)
     cdef double noise = INFINITY, binomial = 1.0, size, period = 0.0
-    cdef int count = shared.samples, order, i, c
-    for i in range(count):
+    cdef int order, i, c
+    for i in range(FIRST_SAMPLES):
         differences[i] = m.first_y[i]
     rough[0] = 0.0
     for order in range(1, m.n + 2):
         binomial *= (4.0 * order - 2.0) / order  # (2 order)! / order!^2
-        for i in range(count - order):
+        for i in range(FIRST_SAMPLES - order):
             differences[i] = differences[i + 1] - differences[i]
             values[i] = fabs(differences[i])
-        size = ranked(values, count - order, 0.5) / MEDIAN / sqrt(binomial)
+        size = median(values, FIRST_SAMPLES - order) / MEDIAN / sqrt(binomial)
         if size > 0.0:
             noise = fmin(noise, size)
         rough[order] = size * size
     if quantum < INFINITY:
         shared.quantum = quantum
-        shared.lattice = share_of_multiples(m.first_y, count, quantum)
+        shared.lattice = share_of_multiples(m.first_y, quantum)
         if shared.lattice > LATTICE_SHARE:
             noise = fmax(quantum / sqrt(12.0), noise if noise < INFINITY else 0.0)
     if noise == INFINITY:
-        noise = quantum
-    for i in range(1, count):
-        period += m.first_h[i] / (count - 1)
+        noise = quantum if quantum < INFINITY else least
+    for i in range(1, FIRST_SAMPLES):
+        period += m.first_h[i] / (FIRST_SAMPLES - 1)
         values[i - 1] = fabs(m.first_h[i] - m.first_h[i - 1])
-    size = ranked(values + 1, count - 2, 0.5) / MEDIAN
-    shared.steady_period, shared.interval = period, m.first_h[count - 1]
+    size = median(values + 1, FIRST_SAMPLES - 2) / MEDIAN
+    shared.steady_period, shared.interval = period, m.first_h[FIRST_SAMPLES - 1]
     shared.jitter = fmax(size * size / 6.0, (EXACT * period) * (EXACT * period))
     noise = fmax(noise, least)
     for order in range(m.n + 2):
@@ -169,25 +137,25 @@ cdef double find_noise(Members* m, double least, double largest) noexcept nogil:
 
 
 cdef void find_sizes(Members* m) noexcept nogil:
-    """Find the squares of the sizes of z by differences of the first samples."""
+    """Find mean squares of z, with doubt, by differences of the first samples."""
     cdef double first[FIRST_SAMPLES]
-    cdef double values[FIRST_SAMPLES]
-    cdef int count = m.shared.samples, stride = max((count - 1) // m.n, 1), length, i, j
+    cdef double total
+    cdef int stride = (FIRST_SAMPLES - 1) // m.n, length, i, j
     m.sizes[0] = 0.0
-    for j in range(count):
+    for j in range(FIRST_SAMPLES):
         first[j] = m.first_y[j]
     for i in range(1, m.n):
-        length = count - i * stride
+        length, total = FIRST_SAMPLES - i * stride, 0.0
         for j in range(length):
             first[j] = (first[j + stride] - first[j]) / (stride * m.shared.steady_period)
-            values[j] = first[j] * first[j]
-        m.sizes[i] = DOUBT * DOUBT * ranked(values, length, MOST)
+            total += first[j] * first[j]
+        m.sizes[i] = DOUBT * DOUBT * total / length
 
 
 cdef void begin(Members* m, double noise) noexcept nogil:
     """Let the members begin at the last sample (D 28)."""
     cdef Shared* shared = &m.shared
-    cdef double y = m.first_y[shared.samples - 1], period = shared.steady_period
+    cdef double y = m.first_y[FIRST_SAMPLES - 1], period = shared.steady_period
     cdef double omega, kappa, intensity, size, least = INFINITY, sizes = 0.0
     cdef int n = m.n, g, i, j, k, below, c
     find_sizes(m)
@@ -202,7 +170,7 @@ cdef void begin(Members* m, double noise) noexcept nogil:
         m.tau[g] = -period / log(GRID.correlation[c]) if c > 0 else 0.0
     memset(m.difference, 0, sizeof(m.difference))
     shared.roughness = 1.0
-    for j in range(shared.samples):
+    for j in range(FIRST_SAMPLES):
         follow_differences(m, m.first_y[j])
     memset(&m.x, 0, sizeof(Estimates))
     memset(m.p.zz, 0, n * (n + 1) // 2 * sizeof(Line))

@@ -8,6 +8,7 @@ from fhaosmo_ros.core.observer.self_tuning.members cimport (
     BANDS, BAND_STEP, COLOURS, COUNT, FIRST_SAMPLES, GRID, HALF, IN_BAND, Members, ORDERS, Shared,
     Work, entry, fill, largest, power
 )
+from fhaosmo_ros.core.observer.self_tuning.noise cimport FADED
 from fhaosmo_ros.core.vectors cimport VECTORISED
 from fhaosmo_ros.core.observer.structure cimport GATE
 
@@ -15,8 +16,6 @@ from fhaosmo_ros.core.observer.structure cimport GATE
 # is below that of the likeliest: a larger d needs more reason to be believed.
 # One that is FLOOR below has no weight.
 cdef double FLOOR = 30.0, QUANTISED_FLOOR = 100.0
-# A member is clearly likelier than another one if its log-likelihood is so much larger.
-cdef double CLEARLY = 2.0
 
 
 cdef VECTORISED judge(Members* m, double grown, double kept) noexcept nogil:
@@ -81,7 +80,7 @@ cdef void tell_model(Members* m, double slider, bint jumped, Model* model) noexc
     cdef Shared* shared = &m.shared
     cdef int g, k
     cdef double noise, a, twice, edge, h = m.work.sample.h
-    if m.score[shared.told] < -CLEARLY:
+    if 2.0 * m.score[shared.told] < -FADED:
         shared.told = shared.likeliest
     g = shared.told
     k, noise, a = GRID.order[g], m.work.now[GRID.colour[g]], m.correlation[g]
