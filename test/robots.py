@@ -6,10 +6,7 @@ import numpy as np
 JOINTS = ('turn', 'shoulder', 'elbow')
 
 
-def segment(
-    name: str, parent: str, child: str, axis: str, z: float, mass: float = 0.0,
-    length: float = 0.0, kind: str = 'revolute',
-) -> str:  # fmt: skip
+def segment(name, parent, child, axis, z, mass=0.0, length=0.0, kind='revolute'):
     """Return a joint at the end of its parent, and the rod along z that it moves."""
     inertia = mass * length**2 / 12.0
     return (

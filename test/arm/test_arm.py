@@ -153,12 +153,11 @@ def test_a_push_is_found_told_and_located(free, measurement):
 
 
 def test_currents_and_gravity_compensated_effort(free):
-    t, q, v, torque = free
+    constants, (t, q, v, torque) = [8.0, 4.0, 0.5], free
     gravity = np.array([MODEL.terms(*row).gravity for row in zip(q, v, strict=True)])
     expected = run(Arm(URDF), free).external_torque
     other = Arm(URDF, effort='gravity_compensated')
     np.testing.assert_allclose(run(other, free, push=gravity).external_torque, expected, atol=1e-6)
-    constants = [8.0, 4.0, 0.5]
     other = Arm(URDF, effort='current', torque_constants=constants)
     np.testing.assert_allclose(other.run(t, q, torque / constants).external_torque, expected)
 
@@ -231,8 +230,7 @@ def test_noise_that_nobody_told_is_found_and_makes_no_contact(free):
     arm, random = Arm(URDF), np.random.default_rng(5)
     t, q, _, torque = free
     noise = np.array([0.02, 0.2, 0.1])
-    noisy = torque + noise * random.standard_normal(q.shape)
-    assert not arm.run(t, q, noisy).contact[500:].any()
+    assert not arm.run(t, q, torque + noise * random.standard_normal(q.shape)).contact[500:].any()
     np.testing.assert_allclose(np.sqrt(arm._samples.noise.variance[0]), noise, rtol=0.15)
     told = Arm(URDF, position_noise=[20.0 * NOISE], torque_noise=[0.5])
     shaken = q + 20.0 * NOISE * random.standard_normal(q.shape)
@@ -264,10 +262,8 @@ STAMPS = {
     'samples are missing': (LOSSY, stamped(LOSSY, 0.1 * SHAKEN[: len(LOSSY)]), {}),
     'another rate': (FASTER, stamped(FASTER, 0.02 * SHAKEN), {}),
     'the driver publishes twice': (np.repeat(T[::2], 2), T, {}),
-    'the host hangs': (T, hanging(T), {}),
     'the host hangs, and samples are missing': (LOSSY, hanging(LOSSY), {}),
     'the clock is set forward a little': (T, stamped(T, 0.1 * SHAKEN + 0.02 * (T > 3.5)), {}),
-    'silence': (T, T + 0.4 * (T > 2.0), {'restarts': 1}),
     'the clock was 0 at first': (T, T + 1.7e9 * (T > 2.0), {'restarts': 1}),
     'the clock is set back': (T, T - 5.0 * (T > 2.0), {'clock set back': 1}),
 }

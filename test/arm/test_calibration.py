@@ -52,8 +52,7 @@ def test_what_the_urdf_leaves_is_explained_also_in_another_motion_and_a_payload_
 def test_noise_is_found_and_stays_finite_for_a_quantised_encoder(found):
     np.testing.assert_allclose(found.calibration.torque_noise, 0.05, rtol=0.1)
     np.testing.assert_allclose(found.calibration.position_noise, 1e-5, rtol=0.1)
-    t = np.arange(0.0, 10.0, 1e-3)
-    rounded = np.round(np.sin(t)[:, np.newaxis] / 1e-4) * 1e-4
+    rounded = np.round(np.sin(1e-3 * np.arange(10_000))[:, np.newaxis], 4)
     assert 0.5 < noise_of(rounded)[0] / (1e-4 / np.sqrt(12.0)) < 2.0
 
 
@@ -65,8 +64,7 @@ def test_links_that_cannot_exist_are_not_found():
     t, q, torque = recorded(duration=12.0, noise=3.0)
     inertial = identify(model, t, q, torque - 5.0 * np.gradient(q, t, axis=0)).calibration.inertial
     model.set_inertial(inertial)  # without payload, and without what rotors add
-    for link in inertial:
-        assert np.linalg.eigvalsh(pseudo_inertia(link).toMatrix())[0] > 0.0
+    assert all(np.linalg.eigvalsh(pseudo_inertia(link).toMatrix())[0] > 0.0 for link in inertial)
 
 
 def test_joints_that_do_not_move_enough_are_named_and_one_that_rests_keeps_its_urdf():
