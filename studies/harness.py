@@ -20,6 +20,7 @@ from fhaosmo_ros.tools.cli.command import progress, run_command
 from matplotlib.figure import Figure
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import expm
 from studies import evidence
 from studies.evidence import DOCS, Row
 
@@ -38,6 +39,18 @@ class Found(NamedTuple):
     tables: Mapping[str, list[Row]]
     texts: Mapping[str, str]
     figures: Mapping[str, Figure]
+
+
+def discretised(rates: Floats, driven: int, period: float) -> tuple[Floats, Floats]:
+    """
+    Return transition and noise over a period for x' = rates x and white noise on one state.
+
+    C. F. Van Loan, IEEE Trans. Automatic Control 23(3), 1978, doi:10.1109/TAC.1978.1101743.
+    """
+    n, drive = len(rates), np.diag(np.eye(len(rates))[driven])
+    block = expm(np.block([[-rates, drive], [np.zeros((n, n)), rates.T]]) * period)
+    transition = block[n:, n:].T
+    return transition, transition @ block[:n, n:]
 
 
 def run_study(

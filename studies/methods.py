@@ -34,7 +34,7 @@ from fhaosmo_ros.tools.tuning.objective import SMALLEST, TUNE_PARAMETERS
 from fhaosmo_ros.tools.tuning.search import BAD, Dimension, minimise
 from fhaosmo_ros.tools.tuning.tuner import DERIVATIVES, RATES, Tuner
 import numpy as np
-from scipy.linalg import expm, solve_discrete_are
+from scipy.linalg import solve_discrete_are
 from studies import harness
 from studies.harness import Floats
 
@@ -226,25 +226,16 @@ class SampledModel:
         self.longest = min(LONGEST * period, resolution)
         self._rates[:n, :n] += jacobian
 
-    def _scaled(self, matrix: Floats) -> Floats:
-        return matrix * self.scale[:, None] / self.scale[None, :]
-
     def kalman(self, intensity: float) -> Floats:
         """
         Return the steady-state Kalman gain for noise of variance 1 on y.
 
         It is for a filter that predicts to t_k and then corrects with y_k itself; white noise of
-        the intensity drives the last state of the chain. What that adds to the scaled covariance
-        over a period is by C. F. Van Loan, IEEE Transactions on Automatic Control 23(3), 1978,
-        doi:10.1109/TAC.1978.1101743.
+        the intensity drives the last state of the chain.
         """
-        a = self._scaled(expm(self._rates * self.period))
-        n, rates = self.size, self._scaled(self._rates) * self.period
-        drive = np.diag(np.eye(n)[-1])
-        exponential = expm(np.block([[-rates, drive], [np.zeros((n, n)), rates.T]]))
-        largest = intensity * self.scale[-1] ** 2 * self.period
-        noise = largest * exponential[n:, n:].T @ exponential[:n, n:]
-        noise = 0.5 * (noise + noise.T)
+        rates = self._rates * self.scale[:, None] / self.scale[None, :]
+        a, noise = harness.discretised(rates, self.size - 1, self.period)
+        noise = 0.5 * intensity * self.scale[-1] ** 2 * (noise + noise.T)
         try:
             with np.errstate(invalid='ignore'):  # the result is checked below
                 p = solve_discrete_are(a.T, np.eye(self.size)[:1].T, noise, np.eye(1))

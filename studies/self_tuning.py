@@ -19,8 +19,7 @@ from fhaosmo_ros.core import Plant
 from fhaosmo_ros.tools.plot.figures import COLOURS, draw_band, TRUTH
 from matplotlib.figure import Figure
 import numpy as np
-from scipy.linalg import expm
-from studies.harness import Floats, Found, Results, run_study
+from studies.harness import discretised, Floats, Found, Results, run_study
 
 BANDWIDTHS = np.geomspace(6e-4, 3.0, 40)  # how fast the d of a member is, rad a sample
 DERIVATIVES = (0, 1, 3)  # how smooth: d is white noise, integrated so many times and once more
@@ -98,35 +97,26 @@ def estimate(model: Floats, y: Floats, period: float) -> Estimates:
     return found
 
 
-def member(
-    model: Floats, period: float, noise: float, omega: float, k: int
-) -> tuple[Floats, Floats, Floats]:
+def member(model: Floats, period: float, noise: float, omega: float, k: int) -> tuple[Floats, ...]:
     """
     Return transition, covariance of what drives it over one period, and first covariance.
 
     (D + kappa)^(k + 1) d is white noise, kappa = DECAY omega, as intense as makes omega the
     filter's bandwidth. States are z, d, (D + kappa) d, .., with zeros behind the last one that the
-    member has. The first covariance of d is its stationary one. By Van Loan (1978),
-    doi:10.1109/TAC.1978.1101743.
+    member has. The first covariance of d is its stationary one.
     """
     n, size, kappa = len(model), len(model) + max(DERIVATIVES) + 1, DECAY * omega
-    a, q = np.zeros((size, size)), np.zeros((size, size))
+    a, first, of_d = np.zeros((size, size)), np.zeros((size, size)), slice(n, n + k + 1)
     a[:n, :n] = model
     a[n - 1, n] = 1.0
-    for i in range(k + 1):
-        a[n + i, n + i] = -kappa
-        if i < k:
-            a[n + i, n + i + 1] = 1.0
-    q[n + k, n + k] = 1.0
+    a[of_d, of_d] = np.eye(k + 1, k=1) - kappa * np.eye(k + 1)
     intensity = noise * period * omega ** (2 * (n + 1 + k))
-    block = expm(np.block([[-a, q], [np.zeros_like(a), a.T]]) * period)
-    transition = block[size:, size:].T
-    first = np.zeros((size, size))
-    for i in range(k + 1):
-        for j in range(k + 1):
-            below = 2 * k - i - j
-            first[n + i, n + j] = comb(below, k - i) / (2.0 * kappa) ** (below + 1)
-    return transition, intensity * (transition @ block[:size, size:]), intensity * first
+    transition, driving = discretised(a, n + k, period)
+    below = range(k, -1, -1)
+    first[of_d, of_d] = [
+        [comb(i + j, i) / (2.0 * kappa) ** (i + j + 1) for j in below] for i in below
+    ]
+    return transition, intensity * driving, intensity * first
 
 
 def noise_of(y: Floats, highest: int) -> float:

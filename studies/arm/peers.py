@@ -10,7 +10,6 @@ Garofalo, N. Mansfeld, J. Jankowski, C. Ott, ICRA 2019, doi:10.1109/ICRA.2019.87
 
 from collections.abc import Callable
 from functools import partial
-from math import factorial
 from typing import NamedTuple
 
 from fhaosmo_ros.core.arm.model import ArmModel
@@ -19,7 +18,7 @@ import numpy as np
 from scipy.linalg import solve_discrete_are
 from scipy.signal import lfilter
 from studies.arm.world import PERIOD, Touched
-from studies.harness import Floats
+from studies.harness import discretised, Floats
 
 
 class Momentum(NamedTuple):
@@ -54,19 +53,13 @@ def classical(m: Momentum, values: dict[str, float]) -> Floats:
 def kalman(on_integral: bool, m: Momentum, values: dict[str, float]) -> Floats:
     """P' = u + d, d a random walk, of bandwidth `speed`, and Y' = p if Y is what is known."""
     h, size = PERIOD, 2 + on_integral
-    power = np.array([h**k / factorial(k) for k in range(size)])  # k integrations
-    a = sum(power[k] * np.eye(size, k=k) for k in range(size))
-    lower = size - 1 - np.arange(size)  # integrations between d and each state
-    noise = np.array([
-        [h ** (i + j + 1) / (factorial(i) * factorial(j) * (i + j + 1)) for j in lower]
-        for i in lower
-    ])  # fmt: skip
+    a, noise = discretised(np.eye(size, k=1), size - 1, h)
     noise *= (values['speed'] * h) ** (2 * size) / h ** (2 * size - 1)
     noise[-2, -2] += (values['model'] / h**on_integral) ** 2
     first = np.eye(size)[:1]
     p = solve_discrete_are(a.T, first.T, noise, np.eye(1))
     gain = p[:, 0] / (p[0, 0] + 1.0)
-    b = np.append(power[:0:-1], 0.0)
+    b = np.append(a[:-1, -1], 0.0)
     closed, pushed = a - np.outer(gain, a[0]), b - gain * b[0]
     x, found = np.zeros((m.p.shape[1], size)), []
     for y, u in zip(m.y if on_integral else m.p, m.drive, strict=True):
