@@ -13,6 +13,7 @@ from libc.string cimport memcpy, memset
 
 from fhaosmo_ros.core.model.prediction cimport MOST_LEVELS, Prediction
 
+from contextlib import suppress
 import math
 
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
@@ -238,39 +239,31 @@ class Uncertainty:
             There is no such covariance in floating-point numbers.
 
         """
-        try:
-            with np.errstate(all='ignore'):
-                h, unit = self._doubled(period)
-        except (ArithmeticError, np.linalg.LinAlgError):
-            h = unit = np.full((1, 1), math.nan)
-        if not np.isfinite(h).all() or not h[0, 0] > 0.0:
+        n, noise = len(self.fresh), math.sqrt(self.variance)
+        steady = np.full((n, n), math.nan)
+        with np.errstate(all='ignore'), suppress(ArithmeticError, np.linalg.LinAlgError):
+            speed = (self.intensity / (self.variance * period)) ** (0.5 / n)
+            unit = noise * speed ** np.arange(n)
+            phi, q = self.linear.transition(period)
+            a = (phi * unit[None, :] / unit[:, None]).T
+            g, h = np.diag(np.eye(n)[0]), q / np.outer(unit, unit)
+            for _ in range(DOUBLINGS):
+                shared = np.linalg.solve(np.eye(n) + g @ h, np.column_stack([a, g]))
+                before = h
+                g = g + a @ shared[:, n:] @ a.T
+                h = h + a.T @ h @ shared[:, :n]
+                a = a @ shared[:, :n]
+                h = 0.5 * (h + h.T)
+                if np.allclose(h, before, rtol=1e-12, atol=0.0):
+                    break
+            steady = h * np.outer(unit, unit)
+        if not np.isfinite(steady).all() or not steady[0, 0] > 0.0:
             raise ConfigurationError(
                 f'parameters {", ".join(map(repr, DECIDING))}: expected values for which there is '
                 'a Kalman filter in floating-point numbers, or noise_size = 0, got a noise of '
-                f'{math.sqrt(self.variance):g} and an intensity of {self.intensity:g}'
+                f'{noise:g} and an intensity of {self.intensity:g}'
             )
-        return h * np.outer(unit, unit)
-
-    def _doubled(self, period):
-        """Return the covariance in the filter's own units, and the units."""
-        n = len(self.fresh)
-        speed = (self.intensity / (self.variance * period)) ** (0.5 / n)
-        unit = math.sqrt(self.variance) * speed ** np.arange(n)
-        phi, q = self.linear.transition(period)
-        a = (phi * unit[None, :] / unit[:, None]).T
-        h = q / np.outer(unit, unit)
-        g = np.zeros((n, n))
-        g[0, 0] = 1.0
-        for _ in range(DOUBLINGS):
-            shared = np.linalg.solve(np.eye(n) + g @ h, np.column_stack([a, g]))
-            before = h
-            g = g + a @ shared[:, n:] @ a.T
-            h = h + a.T @ h @ shared[:, :n]
-            a = a @ shared[:, :n]
-            h = 0.5 * (h + h.T)
-            if np.allclose(h, before, rtol=1e-12, atol=0.0):
-                break
-        return h, unit
+        return steady
 
 
 def stationary(chain, intensity):
@@ -317,7 +310,7 @@ def innovations(Prediction prediction, samples, linear):
     cdef const double[:, ::1] u = samples.u
     cdef const long long[::1] periods = samples.periods
     cdef const unsigned char[::1] used = np.asarray(samples.used, dtype=np.uint8)
-    cdef int n = prediction.n, settled = min(linear.settled, 2**30)
+    cdef int n = prediction.n
     cdef Py_ssize_t k, count = y.shape[0]
     cdef double[::1] b = np.empty(count), s = np.empty(count)
     cdef double[:, ::1] x = np.empty((count, n))
@@ -327,8 +320,8 @@ def innovations(Prediction prediction, samples, linear):
     cdef Row fresh[MOST_LEVELS]
     cdef Row p[MOST_LEVELS]
     cdef double gain[MOST_LEVELS]
-    cdef double variance = 0.0, residual, limit
-    cdef long long since = 0, _
+    cdef double variance = 0.0, limit
+    cdef long long since = 0, settled = min(linear.settled, 2**30), _
     cdef int i, j
     if n > MOST_LEVELS or u.shape[1] < max(prediction.phi.inputs, 1) or not (
         h.shape[0] == u.shape[0] == periods.shape[0] == used.shape[0] == count
@@ -344,36 +337,27 @@ def innovations(Prediction prediction, samples, linear):
                 memset(prediction.x, 0, sizeof(prediction.x))
                 prediction.z[0] = y[k]
                 since, b[k], s[k] = 0, NAN, NAN
-                for i in range(n):
-                    x[k, i] = prediction.z[i]
-                continue
-            prediction.over(h[k], &u[k, 0])
-            if periods[k] > 1:
-                since = 0
-            for _ in range(periods[k]):
+            else:
+                prediction.over(h[k], &u[k, 0])
+                if periods[k] > 1:
+                    since = 0
                 if since <= settled:
-                    carry(n, a, p)
+                    for _ in range(periods[k]):
+                        carry(n, a, p)
+                        for i in range(n):
+                            for j in range(n):
+                                p[i][j] += q[i][j]
+                    variance = p[0][0] + noise
                     for i in range(n):
-                        for j in range(n):
-                            p[i][j] += q[i][j]
-            if since <= settled:
-                variance = p[0][0] + noise
-                for i in range(n):
-                    gain[i] = p[i][0] / variance
-            residual = y[k] - prediction.z[0]
-            b[k], s[k] = residual, variance
-            if used[k]:
-                limit = clip * sqrt(variance)
-                residual = min(max(residual, -limit), limit)
-                for i in range(n):
-                    prediction.z[i] += gain[i] * residual
-                if since <= settled:
-                    for i in range(n):
+                        gain[i] = p[i][0] / variance
+                    for i in range(n if used[k] else 0):
                         for j in range(n):
                             p[i][j] -= gain[i] * gain[j] * variance
-                    since += 1
-            else:
-                since = 0
+                since = since + 1 if used[k] else 0
+                b[k], s[k] = y[k] - prediction.z[0], variance
+                limit = clip * sqrt(variance)
+                for i in range(n if used[k] else 0):
+                    prediction.z[i] += gain[i] * min(max(b[k], -limit), limit)
             for i in range(n):
                 x[k, i] = prediction.z[i]
     return np.asarray(b), np.asarray(s), np.asarray(x)
