@@ -24,8 +24,8 @@ cdef struct Instruction:
 cdef class Expressions:
     cdef readonly int count, states, inputs  # expressions; states and inputs that they may use
     cdef readonly object source  # what it was made from
-    cdef Instruction* code  # of all expressions, one behind the other
-    cdef int* offsets  # expression i is code[offsets[i]] .. code[offsets[i + 1] - 1]
+    cdef const Instruction[::1] code  # of all expressions, one behind the other
+    cdef const int[::1] offsets  # expression i is code[offsets[i]] .. code[offsets[i + 1] - 1]
     cdef Dual evaluate(
         self, int i, const double* z, const double* dz, const double* u
     ) noexcept nogil

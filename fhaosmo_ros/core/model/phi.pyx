@@ -10,9 +10,10 @@ forward-mode differentiation (dual numbers).
 from libc.math cimport (
     atan2, copysign, cos, exp, fabs, hypot, isnan, log, pow, sin, sqrt, tan, tanh
 )
-from libc.stdlib cimport free, malloc
 
 import numpy as np
+
+INSTRUCTION = [('code', np.intc), ('index', np.intc), ('constant', np.float64)]
 
 
 cdef inline double sign_of(double a) noexcept nogil:
@@ -39,27 +40,11 @@ cdef class Expressions:
     """
 
     def __cinit__(self, source, int states, int inputs):
-        cdef int k = 0, i
         self.source = tuple(tuple((int(c), float(x)) for c, x in one) for one in source)
         self.count, self.states, self.inputs = len(self.source), states, inputs
-        self.code = <Instruction*>malloc(
-            (1 + sum(map(len, self.source))) * sizeof(Instruction)
-        )
-        self.offsets = <int*>malloc((self.count + 1) * sizeof(int))
-        if self.code == NULL or self.offsets == NULL:
-            raise MemoryError
-        for i, expression in enumerate(self.source):
-            self.offsets[i] = k
-            for code, operand in expression:
-                self.code[k].code = code
-                self.code[k].index = <int>operand if code in (STATE, INPUT) else 0
-                self.code[k].constant = operand
-                k += 1
-        self.offsets[self.count] = k
-
-    def __dealloc__(self):
-        free(self.code)
-        free(self.offsets)
+        code = [(c, 0 if c == CONST else x, x) for one in self.source for c, x in one]
+        self.code = np.array([*code, (CONST, 0, 0.0)], dtype=INSTRUCTION)  # never empty
+        self.offsets = np.cumsum([0, *map(len, self.source)], dtype=np.intc)
 
     def __reduce__(self):
         return Expressions, (self.source, self.states, self.inputs)
@@ -73,12 +58,11 @@ cdef class Expressions:
         Outside its domain an operation gives NaN or infinity.
         """
         cdef Dual stack[MOST_OPERANDS]
-        cdef Instruction* instruction
-        cdef Instruction* end = self.code + self.offsets[i + 1]
+        cdef const Instruction* instruction = &self.code[self.offsets[i]]
+        cdef const Instruction* end = &self.code[self.offsets[i + 1]]
         cdef Dual* top = stack - 1
         cdef int code
         cdef double a, da, b, db, v, d
-        instruction = self.code + self.offsets[i]
         while instruction != end:
             code = instruction.code
             if code <= INPUT:

@@ -72,18 +72,17 @@ cdef class Cascade(SlidingMode):
         Level i then has alpha_i psi_i(eps_i) = z_{i+1}', and its internal state lags by its
         injection.
         """
-        cdef double z[MOST_LEVELS]
+        cdef double z[MOST_LEVELS + 1]
         cdef double still[MOST_LEVELS]
-        cdef double rate, wanted, low, high, middle, eps, injection
+        cdef double m = self.trial[0].z_hat, rate, wanted, low, high, middle, injection
         cdef int i, _, n = self.levels
         for i in range(n):
             z[i], still[i] = self.trial[i].z_hat, 0.0
+        z[n] = z[n + 1] = 0.0
         for i in range(n):
-            rate = 0.0
+            rate = z[i + 2]
             if i + 1 < n:
-                rate = evaluate(self.prediction.phi, i + 1, z, still, u).value
-                if i + 2 < n:
-                    rate += z[i + 2]
+                rate += evaluate(self.prediction.phi, i + 1, z, still, u).value
             wanted = min(fabs(rate) / self.gains[i].alpha, 1.0)
             low, high = 0.0, 0.0 if self.is_sign else 1.0 / self.gains[i].inverse_width
             for _ in range(BISECTIONS):
@@ -92,14 +91,9 @@ cdef class Cascade(SlidingMode):
                     low = middle
                 else:
                     high = middle
-            eps = copysign(high, rate)
-            injection = 0.0
-            if high > 0.0:
-                injection = self.gains[i].lambda_ * pow(high, self.memory.gamma) * wanted
-            self.trial[i].z_hat = (
-                self.trial[0].z_hat if i == 0 else self.trial[i - 1].z_tilde
-            ) - eps
-            self.trial[i].z_tilde = (z[i + 1] if i + 1 < n else 0.0) - copysign(injection, rate)
+            injection = self.gains[i].lambda_ * pow(high, self.memory.gamma) * wanted
+            self.trial[i].z_hat = m - copysign(high, rate)
+            m = self.trial[i].z_tilde = z[i + 1] - copysign(injection, rate)
 
     cdef void explicit(self, double gamma, double y, double h, const double* u) noexcept nogil:
         """
