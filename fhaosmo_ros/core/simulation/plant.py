@@ -8,7 +8,6 @@ from fhaosmo_ros.core.model.inputs import Floats, known_inputs
 from fhaosmo_ros.core.model.triangular import TriangularModel
 from fhaosmo_ros.core.observer.configuration import per_level
 from fhaosmo_ros.core.parameters.declaration import Parameters
-from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.tables import PLANT_PARAMETERS
 from fhaosmo_ros.core.simulation.system import Disturbance, System
 import numpy as np
@@ -126,7 +125,7 @@ class Plant:
             A time that is not finite, or another number of inputs.
 
         """
-        self._states([t], known_inputs(u, self._model.inputs)[np.newaxis])
+        self._system.advance(t, known_inputs(u, self._model.inputs)[np.newaxis])
 
     @property
     def states(self) -> Floats:
@@ -135,7 +134,7 @@ class Plant:
 
     def unknown_input(self, t: float) -> float:
         """Return d at the time `t`."""
-        return float(self._d.along(np.array([t]))[0])
+        return float(self._d.along(t)[0])
 
     def measure(self, t: float) -> float:
         """
@@ -172,15 +171,8 @@ class Plant:
             A time that is not finite, or u of another shape.
 
         """
-        t, z = self._states(t, known_inputs(u, self._model.inputs, np.size(t)))
+        z = self._system.advance(t, known_inputs(u, self._model.inputs, np.size(t)))
         return Truth(self._measured(z[:, 0]), z, self._d.along(t))
-
-    def _states(self, t: ArrayLike, u: Floats) -> tuple[Floats, Floats]:
-        """Return times, checked, and the states at them; the simulation has gone there."""
-        t = np.ascontiguousarray(t, dtype=np.float64)
-        if not np.all(np.isfinite(t)):
-            raise ConfigurationError('plant: expected finite times, got some that are not')
-        return t, self._system.advance(t, u)
 
     def _measured(self, z1: Any) -> Any:
         noise = self._parameters['noise_std']
@@ -226,8 +218,7 @@ def respond(
         Longest step in seconds; each interval is divided evenly.
 
     """
-    t, d = np.ascontiguousarray(t, dtype=np.float64), Disturbance({}, table, spacing)
-    z = np.broadcast_to(initial_state, model.order)
-    system = System(model.expressions, d, step, z)
-    inputs = known_inputs(u, model.inputs, len(t))
-    return system.advance(t, inputs, on_grid=False), d.along(t)
+    d, z = Disturbance({}, table, spacing), np.broadcast_to(initial_state, model.order)
+    inputs = known_inputs(u, model.inputs, np.size(t))
+    states = System(model.expressions, d, step, z).advance(t, inputs, on_grid=False)
+    return states, d.along(t)

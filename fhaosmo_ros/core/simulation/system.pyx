@@ -7,6 +7,7 @@ from libc.string cimport memcpy
 from fhaosmo_ros.core.model.phi cimport Expressions, evaluate
 from fhaosmo_ros.core.model.prediction cimport CLASSICAL, MOST_LEVELS, take_step
 
+from fhaosmo_ros.core.parameters.errors import ConfigurationError
 import numpy as np
 
 # A chirp sweeps over so many times its first angular frequency, within this time (s).
@@ -75,7 +76,7 @@ cdef class Disturbance:
         return self.offset + self.amplitude * wave
 
     def along(self, t):
-        """Return d at times `t` (s), an array of their shape (K,)."""
+        """Return d, (K,), at times `t` (s), (K,) or a number."""
         cdef const double[::1] times = np.ascontiguousarray(t, dtype=np.float64)
         cdef double[::1] d = np.empty(times.shape[0])
         cdef Py_ssize_t k
@@ -164,7 +165,7 @@ cdef class System(Dynamics):
 
         Parameters
         ----------
-        t : (K,) array
+        t : (K,) array or number
             Times since t = 0 (s), finite and not decreasing.
         u : (K, m) array
             Known inputs of the interval that ends at each.
@@ -173,20 +174,21 @@ cdef class System(Dynamics):
             evenly, so that a step has one value of each known input.
 
         """
-        cdef const double[::1] times = t
-        cdef const double[:, ::1] inputs = u if u.shape[1] else np.zeros((len(t), 1))
-        cdef double[:, ::1] states = np.empty((times.shape[0], self.size))
-        cdef Py_ssize_t k
-        if u.shape[0] != times.shape[0] or u.shape[1] < self.phi.inputs:
-            raise ValueError(f'expected known inputs of shape ({len(t)}, m), got {u.shape}')
-        for k in range(times.shape[0]):
+        cdef const double[::1] times = np.ascontiguousarray(t, dtype=np.float64)
+        cdef const double[:, ::1] inputs = u if u.shape[1] else np.zeros((len(u), 1))
+        cdef Py_ssize_t k, count = times.shape[0]
+        cdef double[:, ::1] states = np.empty((count, self.size))
+        if u.shape[0] != count or u.shape[1] < self.phi.inputs:
+            raise ValueError(f'expected known inputs of shape ({count}, m), got {u.shape}')
+        if not np.isfinite(times).all():
+            raise ConfigurationError('plant: expected finite times, got some that are not')
+        for k in range(count):
             if on_grid:
                 self.go_to(times[k], &inputs[k, 0])
             else:
                 self.go_evenly(times[k - 1] if k > 0 else 0.0, times[k], &inputs[k, 0])
             memcpy(&states[k, 0], self.z, self.size * sizeof(double))
-        if times.shape[0]:
-            self.held = inputs[times.shape[0] - 1]
+            self.held = inputs[k]
         return np.asarray(states)
 
     def go_on(self, double t):
