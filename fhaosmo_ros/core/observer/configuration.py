@@ -81,9 +81,8 @@ class ObserverConfiguration:
             )
         self.self_tuning: bool = p['gains'] == 'self_tuning'
         self.schedule: Uncertainty | None = None
-        self.steady = np.zeros((0, 0))
-        sizes = OBSERVER_PARAMETERS['state_sizes']
-        self.state_sizes = per_level(sizes, p['state_sizes'], self.model.order)
+        self.steady, n = np.zeros((0, 0)), self.model.order
+        self.state_sizes = per_level(OBSERVER_PARAMETERS['state_sizes'], p['state_sizes'], n)
         self.prediction_step = p['prediction_step'] or usual_step(self.model)
         self._check_structure()
         if self.self_tuning:
@@ -175,30 +174,22 @@ class ObserverConfiguration:
         return per_level(OBSERVER_PARAMETERS[name], self.parameters[name], self.levels)
 
     def _complete_schedule(self, schedule: Uncertainty) -> None:
-        p, n = self.parameters, self.levels
+        p, n, small = self.parameters, self.levels, self.parameters['noise_size']
+        period, shares = p['correction_period'], deadbeat_shares(n)
         self.next_sizes, self.tuned_over_kalman = np.zeros(n), np.ones(n)
         self.next_sizes[: self.model.order] = [*self.state_sizes[1:], p['unknown_input_size']]
-        self.steady = schedule.steady(p['correction_period'])
-        tuned = self.tuned_corrections(p['noise_size'], p['correction_period'])
-        wanted = self.steady[0] / schedule.variance
-        alike = (wanted > 0.0) & (tuned > 0.0)
-        ratio = np.clip(tuned[alike] / wanted[alike], 1e-6, 1e6)
-        self.tuned_over_kalman[alike] = ratio
-
-    def tuned_corrections(self, small: float, period: float) -> Floats:
-        """Return S_1 .. S_N of D 19 with which an innovation of the size `small` is corrected."""
-        n = self.levels
+        self.steady = schedule.steady(period)
         level, grid = np.arange(1, n + 1), np.linspace(0.0, 1.0, self.curves.shape[1])
         injections = self.lambdas * small ** (2.0 * self.gamma_initial * (n - level) / n - 1.0)
         injections *= [
             np.interp(small / width, grid, curve)
             for width, curve in zip(self.widths, self.curves, strict=True)
         ]
-        shares = deadbeat_shares(n)
-        return np.array([
-            sum(shares[j, i] * period ** (j - i + 1) * injections[j] for j in range(i, n))
-            for i in range(n)
-        ])  # fmt: skip
+        for i, wanted in enumerate(self.steady[0] / schedule.variance):
+            # S_i of D 19, with which an innovation of the size of the noise is corrected.
+            tuned = sum(shares[j, i] * period ** (j - i + 1) * injections[j] for j in range(i, n))
+            if wanted > 0.0 and tuned > 0.0:
+                self.tuned_over_kalman[i] = np.clip(tuned / wanted, 1e-6, 1e6)
 
 
 def deadbeat_shares(count: int) -> Floats:

@@ -93,7 +93,6 @@ cdef class Levant(SlidingMode):
             self.next_size = configuration.next_sizes
 
     cdef void restart(self, double y) noexcept nogil:
-        """Begin afresh from `y`; the time of the next sample counts from it."""
         cdef Memory* memory = &self.memory
         SlidingMode.restart(self, y)
         memory.saturated = memory.beyond = memory.offset = memory.watched = 0.0
@@ -259,11 +258,9 @@ cdef class Levant(SlidingMode):
         return min(max(b, -c * usual), c * usual) * WITHIN / (1.0 - share)
 
     cdef double innovation_variance(self) noexcept nogil:
-        """Return the variance that the latest innovation was expected to have."""
         return self.trial_covariance[0][0] + self.noise_variance
 
     cdef double most_change(self, int i) noexcept nogil:
-        """Return how much Phi_{i+1} may change in a jump of y that it does not contradict."""
         return OF_SIZE * self.next_size[i]
 
     cdef void go_on_after_jump(self, double of_state) noexcept nogil:

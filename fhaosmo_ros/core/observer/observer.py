@@ -22,8 +22,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 OF_PAPER = 'lambda', 'alpha', 'fuzzy_widths'
-DEFINING = 'phi', 'gains', *OF_PAPER
-DEFAULTS = OBSERVER_PARAMETERS.defaults()
 
 
 def make_structure(configuration: ObserverConfiguration) -> Any:
@@ -71,8 +69,8 @@ class Observer:
     def __init__(self, parameters: Mapping[str, Any] | None = None, /, **named: Any) -> None:
         given = ESTIMATOR_PARAMETERS.complete(parameters, named)
         self.structure = make_structure(ObserverConfiguration(given))
-        defaults = {name for name in DEFINING if self.parameters[name] == DEFAULTS[name]}
-        if 'phi' not in defaults and {'gains', *OF_PAPER} <= defaults:
+        told = {p.name for p in OBSERVER_PARAMETERS.values() if given[p.name] != p.default}
+        if 'phi' in told and told.isdisjoint({'gains', *OF_PAPER}):
             warnings.warn(
                 "the default gains are for the paper's plant, and phi is of another one: set "
                 f'gains to self_tuning, or find {", ".join(OF_PAPER)} with the command tune',

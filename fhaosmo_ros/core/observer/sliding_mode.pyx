@@ -88,13 +88,11 @@ cdef class SlidingMode(Structure):
             fill(self.fresh, schedule.fresh)
 
     cdef void reset(self) noexcept nogil:
-        """Go back to the state before any sample."""
         Structure.reset(self)
         SlidingMode.restart(self, NAN)
         self.level = self.first
 
     cdef void restart(self, double y) noexcept nogil:
-        """Begin afresh from `y`; the time of the next sample counts from it."""
         self.level, self.covariance = self.first, self.fresh
         self.level[0].z_hat = self.memory.y = y
         self.memory.gamma, self.memory.pending = self.gamma_initial, 0.0
@@ -120,7 +118,6 @@ cdef class SlidingMode(Structure):
             self.memory.offset = self.memory.jumps = 0.0
 
     cdef void advance(self, double y, double h, const double* u) noexcept nogil:
-        """See `Structure.advance`."""
         self.loss = self.gradient = 0.0
         if self.scheduled:
             memcpy(self.trial_covariance, self.covariance, self.levels * sizeof(Row))
@@ -130,7 +127,7 @@ cdef class SlidingMode(Structure):
         """Advance `trial` by the equations of the structure and its scheme."""
 
     cdef int accept(self, double y, double h) noexcept nogil:
-        """Make `trial` the state, adapt gamma; return status flags."""
+        """Adapt gamma, then accept."""
         cdef int word = self.adapt(h) if self.adaptive else 0
         Structure.accept(self, y, h)
         if self.scheduled:
