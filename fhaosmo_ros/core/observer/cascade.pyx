@@ -53,9 +53,8 @@ cdef class Cascade(SlidingMode):
         b = y - self.prediction.z[0]
         b = min(max(b, -MOST_SIGMAS * sqrt(s)), MOST_SIGMAS * sqrt(s))
         for i in range(n):
-            self.trial[i].z_hat = (
-                self.prediction.z[i] + self.trial_covariance[0][i] / s * b  # K = P C' / S
-            )
+            # K = P C' / S
+            self.trial[i].z_hat = self.prediction.z[i] + self.trial_covariance[0][i] / s * b
             self.trial[i].p = self.trial[i].q = 0.0
         for i in range(n):
             self.trial[i].z_tilde = self.trial[i + 1].z_hat if i + 1 < n else 0.0

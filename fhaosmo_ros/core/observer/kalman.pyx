@@ -28,11 +28,6 @@ cdef double MOST_STEPS = 100.0
 # size of d that is too small, but it does on the opposite.
 STATES_DOUBT, INPUT_DOUBT = 5.0, 0.4
 DOUBLINGS = 60
-# Parameters that decide whether there is a steady covariance.
-DECIDING = (
-    'noise_size', 'unknown_input_size', 'unknown_input_rate', 'unknown_input_decay',
-    'correction_period', 'structure', 'phi',
-)
 
 
 cdef fill(Row* to, matrix):
@@ -105,15 +100,9 @@ cdef void correct(int n, Row* p, double variance) noexcept nogil:
 
 cdef class LinearModel:
     """
-    A linear model whose last state is driven by white noise.
+    A linear model x' = A x whose last state is driven by white noise of some intensity.
 
-    Parameters
-    ----------
-    rates : (N, N) array
-        A of x' = A x (1/s).
-    intensity : float
-        Of the white noise.
-
+    `rates` is A, (N, N), in 1/s.
     """
 
     def __cinit__(self, rates, double intensity):
@@ -232,12 +221,7 @@ class Uncertainty:
 
         By the structure-preserving doubling algorithm (Chu, Fan, Lin and Wang 2004,
         doi:10.1080/00207170410001714988), in units in which the filter has a bandwidth of 1.
-
-        Raises
-        ------
-        ConfigurationError
-            There is no such covariance in floating-point numbers.
-
+        Where there is none in floating-point numbers it raises ConfigurationError.
         """
         n, noise = len(self.fresh), math.sqrt(self.variance)
         steady = np.full((n, n), math.nan)
@@ -259,21 +243,20 @@ class Uncertainty:
             steady = h * np.outer(unit, unit)
         if not np.isfinite(steady).all() or not steady[0, 0] > 0.0:
             raise ConfigurationError(
-                f'parameters {", ".join(map(repr, DECIDING))}: expected values for which there is '
-                'a Kalman filter in floating-point numbers, or noise_size = 0, got a noise of '
-                f'{noise:g} and an intensity of {self.intensity:g}'
+                "parameters 'noise_size', 'unknown_input_size', 'unknown_input_rate', "
+                "'unknown_input_decay', 'correction_period', 'structure', 'phi': expected values "
+                'for which there is a Kalman filter in floating-point numbers, or noise_size = 0, '
+                f'got a noise of {noise:g} and an intensity of {self.intensity:g}'
             )
         return steady
 
 
 def stationary(chain, intensity):
     """Return the covariance of a chain whose last state is driven by white noise."""
-    size = len(chain)
-    drive = np.zeros((size, size))
-    drive[-1, -1] = intensity
-    eye = np.eye(size)
+    size, eye = len(chain), np.eye(len(chain))
+    drive = np.append(np.zeros(size**2 - 1), -intensity)
     whole = np.kron(chain, eye) + np.kron(eye, chain)
-    return np.linalg.solve(whole, -drive.ravel()).reshape(size, size)
+    return np.linalg.solve(whole, drive).reshape(size, size)
 
 
 def innovations(Prediction prediction, samples, linear):
@@ -321,7 +304,7 @@ def innovations(Prediction prediction, samples, linear):
     cdef Row p[MOST_LEVELS]
     cdef double gain[MOST_LEVELS]
     cdef double variance = 0.0, limit
-    cdef long long since = 0, settled = min(linear.settled, 2**30), _
+    cdef long long since = 0, settled = linear.settled, _
     cdef int i, j
     if n > MOST_LEVELS or u.shape[1] < max(prediction.phi.inputs, 1) or not (
         h.shape[0] == u.shape[0] == periods.shape[0] == used.shape[0] == count

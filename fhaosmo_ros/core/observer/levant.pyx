@@ -75,7 +75,7 @@ cdef class Levant(SlidingMode):
     cdef const double[::1] next_size  # sizes of z_2 .. z_n, d
 
     def __cinit__(self, configuration):
-        cdef int i, n = self.levels
+        cdef int n = self.levels
         self.widest = INFINITY
         # With larger powers saturated levels find y again by themselves.
         if not self.is_sign and self.gamma_initial < 0.5:
@@ -83,8 +83,6 @@ cdef class Levant(SlidingMode):
             speed = (configuration.lambdas[n - 1] / configuration.widths[n - 1]) ** (1.0 / n)
             self.relaxation = speed / 3.0
         self.share = deadbeat_shares(n)
-        for i in range(n):
-            self.ratio[i] = 1.0
         self.correction_period = configuration.parameters['correction_period']
         if self.scheduled:
             fill(self.steady, configuration.steady)

@@ -45,7 +45,6 @@ cdef class SlidingMode(Structure):
     cdef Row fresh[MOST_LEVELS]  # P of a fresh observer
     cdef void follow(self, double y, double h, const double* u) noexcept nogil
     cdef int adapt(self, double h) noexcept nogil
-    cdef void fit(self) noexcept
     cdef void predict_trial(self, double h, const double* u) noexcept nogil
     cdef double bandwidth(self, double h) noexcept nogil
     cdef void correct_trial(self, double doubt) noexcept nogil

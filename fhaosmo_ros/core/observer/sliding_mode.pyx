@@ -99,13 +99,9 @@ cdef class SlidingMode(Structure):
         self.memory.settled = 0.0 if self.scheduled else 1.0
 
     def load_state_dict(self, values):
-        """Go on where an observer of the same size was; see `Structure.load_state_dict`."""
-        Structure.load_state_dict(self, values)
-        self.fit()
-
-    cdef void fit(self) noexcept:
-        """Bring gamma within its bounds, and forget what is not carried along."""
+        """Load it, bring gamma within its bounds, and forget what is not carried along."""
         cdef int i
+        Structure.load_state_dict(self, values)
         if self.adaptive:
             self.memory.gamma = min(max(self.memory.gamma, self.gamma_min), self.gamma_max)
         else:
