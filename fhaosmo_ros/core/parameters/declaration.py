@@ -2,6 +2,7 @@
 """What a parameter is: declared once, checked everywhere by the same rules."""
 
 from collections.abc import Iterable, Iterator, Mapping
+from copy import copy
 from dataclasses import dataclass, replace
 import difflib
 import math
@@ -209,10 +210,7 @@ class ParameterTable(Mapping[str, Parameter]):
 
     def defaults(self) -> dict[str, Any]:
         """Return a fresh dictionary of the defaults."""
-        return {
-            p.name: list(p.default) if isinstance(p.default, list) else p.default
-            for p in self.values()
-        }
+        return {p.name: copy(p.default) for p in self.values()}
 
     def complete(
         self, values: 'Mapping[str, Any] | None' = None, named: 'Mapping[str, Any] | None' = None
@@ -224,14 +222,10 @@ class ParameterTable(Mapping[str, Parameter]):
         table have been checked already and are not checked again: of a larger table the part that
         this one declares is taken. Raises as `coerce`.
         """
-        if named:
-            named = {name.removesuffix('_'): value for name, value in named.items()}
-            values = self.coerce(values or {}) | self.coerce(named)
-        if isinstance(values, Parameters):
-            if values.table is self:
-                return values
-            return Parameters(self, self.part_of(values))
-        return Parameters(self, self.coerce(values or {}))
+        if isinstance(values, Parameters) and not named:
+            return values if values.table is self else Parameters(self, self.part_of(values))
+        named = {name.removesuffix('_'): value for name, value in (named or {}).items()}
+        return Parameters(self, self.coerce(values or {}) | self.coerce(named))
 
     def coerce(self, values: Mapping[str, Any]) -> dict[str, Any]:
         """
