@@ -64,7 +64,7 @@ def in_core(parameters: dict[str, Any], y: np.ndarray) -> Callable[[], np.ndarra
 
     def run() -> np.ndarray:
         observer.structure.load_state_dict(start)
-        run_structure(observer.structure, rest, h, u, count)
+        run_structure(observer.structure, rest, h, u)
         return _numbers(observer)
 
     return run

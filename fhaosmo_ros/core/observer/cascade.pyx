@@ -71,7 +71,7 @@ cdef class Cascade(SlidingMode):
         Level i then has alpha_i psi_i(eps_i) = z_{i+1}', and its internal state lags by its
         injection.
         """
-        cdef double z[MOST_LEVELS + 1]
+        cdef double z[MOST_LEVELS + 2]
         cdef double still[MOST_LEVELS]
         cdef double m = self.trial[0].z_hat, rate, wanted, low, high, middle, injection
         cdef int i, _, n = self.levels
@@ -91,6 +91,7 @@ cdef class Cascade(SlidingMode):
                 else:
                     high = middle
             injection = self.gains[i].lambda_ * pow(high, self.memory.gamma) * wanted
+            injection = injection if high > 0.0 else 0.0
             self.trial[i].z_hat = m - copysign(high, rate)
             m = self.trial[i].z_tilde = z[i + 1] - copysign(injection, rate)
 
