@@ -88,9 +88,12 @@ class Field(NamedTuple):
             if isinstance(step, str):
                 around, node = node, getattr(node, step)
                 continue
-            names = getattr(around, step.names) if isinstance(step, Key) else []
             try:
-                node = node[names.index(step.name) if isinstance(step, Key) else step]
+                if isinstance(step, Key):
+                    names = getattr(around, step.names)
+                    node = node[names.index(step.name)]
+                else:
+                    node = node[step]
             except ValueError:
                 raise MissingElementError(self.text, step, names) from None
             except IndexError:

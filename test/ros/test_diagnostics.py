@@ -186,7 +186,8 @@ def test_freeze_holds_gamma_and_lets_it_go(fed):
     before = [fed.feed(0.2 + 0.1 * math.sin(k)) for k in range(12)][-1]
     assert freeze(True) == 'gamma is held'
     assert fed.feed(0.5).gamma == before.gamma
-    fed.wait_values('observer', lambda values: 'freeze' in values['gamma at'], 'held gamma')
+    held = 'gamma is held by ~/freeze'
+    fed.wait_values('observer', lambda values: values[held] == 'True', held)
     assert freeze(False) == 'gamma adapts again'
     assert fed.feed(0.5).gamma != before.gamma
 

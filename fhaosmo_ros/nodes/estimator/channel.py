@@ -68,11 +68,10 @@ class Channel:
         self._node, self._typed, self.name = node, typed, name
         self._clock = node.get_clock()
         self._logger = node.get_logger().get_child(name) if name else node.get_logger()
-        self.estimator = estimator
-        self.values = values
+        self.estimator, observer = estimator, estimator.observer
+        self._use(values)
         self._active = False
         self._forget()
-        observer = estimator.observer
         prefix = f'~/{name}/' if name else '~/'
         self._outputs = Outputs(node, prefix, estimator)
         self._events = create_publisher(
@@ -91,6 +90,19 @@ class Channel:
         if name:  # those without a name are the node's
             node.create_service(Trigger, prefix + 'reset', self.reset)
             node.create_service(SetBool, prefix + 'freeze', self.freeze)
+
+    def _use(self, values: Parameters) -> None:
+        self.values = values
+        self._by_clock = values['sampling'] == 'clock'
+        self._on_samples = values['publish_on'] == 'sample'
+
+    def _forget(self) -> None:
+        self._arrived = False
+        self._stale = True
+        self._quiet_until: dict[int, float] = {}
+        self._silent_since: int | None = None
+        self._waits_since = 0.0
+        self._without_sample = 0
 
     def activate(self) -> None:
         """Take samples and publish from now on; the first sample starts the observer afresh."""
@@ -116,7 +128,7 @@ class Channel:
         found = self.estimator.events.on
         self.estimator.adopt(change)
         self._outputs.snapshot(Flag.CHANGED)
-        self.values = values
+        self._use(values)
         if self._active and found != self.estimator.events.on:
             self._say('events are switched off' if found else 'no event yet')
 
@@ -130,27 +142,28 @@ class Channel:
                 self._logger.warning(f'still waiting: {reports[0].text}')
         return reports
 
-    def _forget(self) -> None:
-        self._arrived = False
-        self._stale = True
-        self._quiet_until: dict[int, float] = {}
-        self._silent_since: int | None = None
-        self._waits_since = 0.0
-        self._without_sample = 0
+    def _on_input(self, index: int, name: str, stamp: int, u: float) -> None:
+        if self.pairing.by_stamp and isfinite(u):
+            self.pairing.take_input(index, stamp, u)
+            self._take_paired()
+        elif not self.estimator.set_input(u, index):
+            self._logger.warning(
+                f'rejected {name} = {u}: expected a finite number; the last one is held',
+                throttle_duration_sec=QUIET,
+            )
 
     def _on_sample(self, stamp: int, y: float) -> None:
-        """Take a sample."""
         if not self._active:
             return
         measured = stamp
-        if self.values['sampling'] == 'clock':
+        if self._by_clock:
             stamp = self._clock.now().nanoseconds
-        if not self.pairing.by_stamp:
+        if self.pairing.by_stamp:
+            self.pairing.take_sample(measured, (stamp, y))
+            self._waits_since = perf_counter()
+            self._take_paired()
+        else:
             self._take(stamp, y)
-            return
-        self.pairing.take_sample(measured, (stamp, y))
-        self._waits_since = perf_counter()
-        self._take_paired()
 
     def _take_paired(self, at_once: bool = False) -> None:
         """Step to the samples whose known inputs are there."""
@@ -161,7 +174,7 @@ class Channel:
 
     def _take(self, stamp: int, y: float) -> None:
         """Step the observer to a sample."""
-        estimator, begin = self.estimator, perf_counter()
+        estimator, health, begin = self.estimator, self._health, perf_counter()
         word = estimator.advance(stamp, y)
         now = perf_counter()
         if word & (REJECTED | NEWS):
@@ -169,12 +182,70 @@ class Channel:
         if estimator.events.waiting:
             self._tell_events()
         if not word & UNUSED:
-            health, self._arrived = self._health, True
-            health.latest = now
-            health.samples.append((stamp, now - begin, estimator.policy.structure.unknown_input))
-            self._outputs.sample_used(stamp, now)
-            if self.values['publish_on'] == 'sample':
+            self._arrived, health.latest = True, now
+            health.stamps.append(stamp)
+            health.durations.append(now - begin)
+            health.d.append(estimator.policy.structure.unknown_input)
+            if now >= self._outputs.due:
+                self._outputs.snapshot_of(stamp)
+            if self._on_samples:
                 self._publish()
+
+    def _publish(self) -> None:
+        """Publish the latest estimate, in the typed messages together with other channels'."""
+        estimate, stamp = self.estimator.estimate, self.estimator.stamp
+        if estimate is not None:
+            self._outputs.publish(estimate, stamp)
+            name = self.name or (self.y.field and self.y.field.key) or 'y'
+            self._typed.add(Output(name, stamp, estimate, self.values))
+
+    def tick(self) -> None:
+        """Publish at the node's rate, if it is to; log once that y is silent."""
+        waits, wait = self.pairing.by_stamp, self.values['known_input_wait']
+        if waits and perf_counter() - self._waits_since > wait:  # and no sample follows
+            self._take_paired(at_once=True)
+        if self._arrived:
+            self._arrived = self._stale = False
+            self._silent_since = None
+        elif not self._stale:
+            now, longest = self._clock.now().nanoseconds, self.estimator.silence
+            if self._silent_since is None:  # the clock is not read while samples come
+                self._silent_since = now
+            elif not 0 <= now - self._silent_since <= longest * 1e9:  # or it jumped back
+                self._stale = True
+                self._logger.warning(
+                    f'no usable sample on {self.y.source.topic} for {longest:.3g} s: not '
+                    'publishing until one comes',
+                    throttle_duration_sec=QUIET,
+                )
+        if not self._stale and not self._on_samples:
+            self._publish()
+
+    def _tell(self, word: int, stamp: int, y: float) -> None:
+        """Log what became of a sample, each kind at most every `QUIET` seconds."""
+        flag, now = next(flag for flag in TOLD if word & flag), perf_counter()
+        if now < self._quiet_until.get(flag, 0.0):
+            return
+        self._quiet_until[flag] = now + QUIET
+        counters, offset = self.estimator.counters, self.estimator.offset
+        late = 'expected a stamp later than the one before'
+        if not stamp and not self._by_clock:
+            hint = '; input_stamp: source does without it' if self.y.stamps == 'header' else ''
+            late = f'its {self.y.stamps} stamp is 0: nobody fills it{hint}'
+        jumped = 'z1 follows it, the other estimates go on'
+        if offset:
+            jumped = f'the model contradicts it: y is taken as {offset:.4g} too large'
+        text = TOLD[flag].format(
+            y=y, late=late, jumped=jumped, restarts=counters.restarts, **counters._asdict()
+        )
+        if flag == Status.DIVERGED:
+            self._logger.error(text)
+        elif flag & NEWS:
+            self._logger.warning(text)
+        else:
+            self._logger.warning(
+                f'rejected a sample: {text} ({counters.rejected} rejected so far)'
+            )
 
     def _tell_events(self) -> None:
         """Publish, and log, the events that have begun or ended."""
@@ -190,93 +261,28 @@ class Channel:
         values: Mapping[str, str] | None = None,
     ) -> None:  # fmt: skip
         """Publish on the topic of events; without a stamp, with that of now."""
-        report = Report(f'{self.name} event' if self.name else 'event')
+        report = Report(f'{self.name} event'.lstrip(), values)
         report.find(level, text)
-        report.values |= values or {}
         stamp = stamp or self._clock.now().to_msg()
         self._events.publish(array_of(self._node, stamp, [report], self.values['hardware_id']))
-
-    def _tell(self, word: int, stamp: int, y: float) -> None:
-        """Log what became of a sample, each kind at most every `QUIET` seconds."""
-        counters, offset = self.estimator.counters, self.estimator.offset
-        late = 'expected a stamp later than the one before'
-        if not stamp and self.values['sampling'] != 'clock':
-            hint = '; input_stamp: source does without it' if self.y.stamps == 'header' else ''
-            late = f'its {self.y.stamps} stamp is 0: nobody fills it{hint}'
-        jumped = 'z1 follows it, the other estimates go on'
-        if offset:
-            jumped = f'the model contradicts it: y is taken as {offset:.4g} too large'
-        flag = next(flag for flag in TOLD if word & flag)
-        text = TOLD[flag].format(
-            y=y, late=late, jumped=jumped, restarts=counters.restarts, **counters._asdict()
-        )
-        if not flag & NEWS:
-            text = f'rejected a sample: {text} ({counters.rejected} rejected so far)'
-        now = perf_counter()
-        if now >= self._quiet_until.get(flag, 0.0):
-            self._quiet_until[flag] = now + QUIET
-            if flag == Status.DIVERGED:
-                self._logger.error(text)
-            else:
-                self._logger.warning(text)
-
-    def _on_input(self, index: int, name: str, stamp: int, u: float) -> None:
-        if self.pairing.by_stamp and isfinite(u):
-            self.pairing.take_input(index, stamp, u)
-            self._take_paired()
-        elif not self.estimator.set_input(u, index):
-            self._logger.warning(
-                f'rejected {name} = {u}: expected a finite number; the last one is held',
-                throttle_duration_sec=QUIET,
-            )
-
-    def _publish(self) -> None:
-        """Publish the latest estimate, in the typed messages together with other channels'."""
-        estimate, stamp = self.estimator.estimate, self.estimator.stamp
-        if estimate is not None:
-            self._outputs.publish(estimate, stamp)
-            name = self.name or self.y.element or 'y'
-            self._typed.add(Output(name, stamp, estimate, self.values))
-
-    def tick(self) -> None:
-        """Publish at the node's rate, if it is to; log once that y is silent."""
-        waited = perf_counter() - self._waits_since
-        if self.pairing.by_stamp and waited > self.values['known_input_wait']:
-            self._take_paired(at_once=True)  # samples may wait for inputs, and no sample follows
-        if self._arrived:
-            self._arrived = self._stale = False
-            self._silent_since = None
-        elif not self._stale:
-            now, longest = self._clock.now().nanoseconds, self.estimator.silence
-            if self._silent_since is None:  # the clock is not read while samples come
-                self._silent_since = now
-            elif not 0 <= now - self._silent_since <= longest * 1e9:  # or it jumped back
-                self._stale = True
-                self._logger.warning(
-                    f'no usable sample on {self.y.source.topic} for {longest:.3g} s: not '
-                    'publishing until one comes',
-                    throttle_duration_sec=QUIET,
-                )
-        if not self._stale and self.values['publish_on'] != 'sample':
-            self._publish()
-
-    def reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        """Start the observer afresh with the next sample."""
-        self._reset()
-        return self._done(response, 'reset: the observer starts afresh with the next sample')
 
     def _reset(self) -> None:
         self.estimator.reset()
         self._outputs.snapshot(Flag.RESET)
+
+    def reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        """Start the observer afresh with the next sample."""
+        self._reset()
+        return self._done('reset', 'the observer starts afresh with the next sample', response)
 
     def freeze(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
         """Hold gamma, or let it adapt again."""
         self.estimator.freeze(request.data)
         self._outputs.snapshot(Flag.CHANGED)
         text = 'gamma is held' if request.data else 'gamma adapts again'
-        return self._done(response, f'freeze: {text}')
+        return self._done('freeze', text, response)
 
-    def _done(self, response: Any, text: str) -> Any:
-        response.success, response.message = True, text.partition(': ')[2]
-        self._logger.info(text)
+    def _done(self, service: str, text: str, response: Any) -> Any:
+        response.success, response.message = True, text
+        self._logger.info(f'{service}: {text}')
         return response

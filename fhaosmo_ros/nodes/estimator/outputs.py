@@ -18,7 +18,6 @@ from fhaosmo_ros.inputs import Input, known_inputs, measured_output
 from fhaosmo_ros.nodes.middleware.endpoints import create_publisher, DEPTH, LATCHED, Listeners
 from fhaosmo_ros.nodes.middleware.messages import labelled, message_class, time_message
 from fhaosmo_ros.topics import ARRAY, estimates_of, SNAPSHOT, STANDARD_DEVIATION, TYPED_ESTIMATES
-from geometry_msgs.msg import AccelStamped, WrenchStamped
 import numpy as np
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
@@ -43,11 +42,11 @@ class Outputs:
         state, deviation, tuning = labelled(states), labelled([*states, 'd']), labelled(TUNING)
         innovation = labelled([f'eps{i + 1}' for i in range(observer.levels)])
         self._make: dict[str, Callable[[Estimate, int], Any]] = {
-            'gamma': lambda estimate, _: Float64(data=estimate.gamma),
+            'gamma': lambda estimate, _: self._number(estimate.gamma),
             STANDARD_DEVIATION: lambda *_: deviation(estimator.standard_deviation),
             'tuning': lambda *_: tuning(np.hstack(estimator.tuning)),
             'state': lambda estimate, _: state(estimate.z),
-            'unknown_input': lambda estimate, _: Float64(data=estimate.unknown_input),
+            'unknown_input': lambda estimate, _: self._number(estimate.unknown_input),
             'innovation': lambda estimate, _: innovation(estimate.innovation),
             'stamp': lambda _, stamp: time_message(stamp),
         }
@@ -55,32 +54,39 @@ class Outputs:
             name: create_publisher(node, message_class(kind), prefix + name)
             for name, kind in estimates_of(observer.parameters).items()
         })  # fmt: skip
+        self._float = Float64()
         self._period = PERIOD_OF_SELF_TUNING if observer.self_tuning else PERIOD
-        self._first, self._published = True, 0.0
-        self._labels: list[str] = []
+        self.due, self._labels = 0.0, ['']
         self._snapshots = node.create_publisher(message_class(ARRAY), prefix + SNAPSHOT, LATCHED)
+
+    def _number(self, value: float) -> Float64:
+        self._float.data = value  # it has been copied when `publish` returns
+        return self._float
 
     def publish(self, estimate: Estimate, stamp: int) -> None:
         """Publish an estimate and, last, the stamp of its sample in nanoseconds."""
         for name, publisher in self._listeners.heard().items():
             publisher.publish(self._make[name](estimate, stamp))
 
-    def sample_used(self, stamp: int, now: float) -> None:
-        """Publish a snapshot after the first sample, and if it is time to, by perf_counter."""
-        if self._first or now - self._published >= self._period:
-            # Where samples wait in a queue, the observer may be ahead of this one.
-            begins = self._first and stamp == self._estimator.latest
-            self.snapshot(Flag.STARTED if begins else Flag(0))
+    def snapshot_of(self, stamp: int) -> None:
+        """Publish the snapshot that is due, with this sample."""
+        # Where samples wait in a queue, the observer may be ahead of this one.
+        begins = not self.due and stamp == self._estimator.latest
+        self.snapshot(Flag.STARTED if begins else Flag(0))
 
     def snapshot(self, flags: Flag) -> None:
-        """Publish what the estimator remembers, and what has happened at the latest sample."""
+        """
+        Publish what the estimator remembers, and what has happened at the latest sample.
+
+        The next one is `due` (by perf_counter) a period later, after a reset with the next sample.
+        """
         stamp = self._estimator.latest
         if stamp is not None:
             labels, vector = pack(Snapshot(stamp, flags, self._estimator.state_dict()))
             if labels != self._labels:  # a state before a gap is there only after one
                 self._labels, self._message = labels, labelled(labels)
             self._snapshots.publish(self._message(vector))
-            self._first, self._published = flags == Flag.RESET, perf_counter()
+            self.due = 0.0 if flags == Flag.RESET else perf_counter() + self._period
 
 
 class Output(NamedTuple):
@@ -121,7 +127,7 @@ class TypedOutputs:
             return
         outputs = list(self._waiting.values())
         for name, publisher in self._listeners.heard().items():
-            message = MAKERS[name](outputs)
+            message = _joint_states(outputs) if name == 'joint_states' else _on_axes(name, outputs)
             message.header.frame_id = self._frame
             message.header.stamp = time_message(max(o.stamp for o in outputs))
             publisher.publish(message)
@@ -138,24 +144,16 @@ def _joint_states(outputs: Sequence[Output]) -> JointState:
     )
 
 
-def _wrench(outputs: Sequence[Output]) -> WrenchStamped:
-    message = WrenchStamped()
-    vectors = {'linear': message.wrench.force, 'angular': message.wrench.torque}
+def _on_axes(name: str, outputs: Sequence[Output]) -> Any:
+    """Return a wrench of the efforts, or an accel of the unknown inputs, on their axes."""
+    message = message_class(TYPED_ESTIMATES[name])()
     for output in outputs:
         vector, axis = output.values['output_axis'].split('.')
-        setattr(vectors[vector], axis, output.effort)
+        if name == 'wrench':
+            vector = {'linear': 'force', 'angular': 'torque'}[vector]
+        d = output.effort if name == 'wrench' else float(output.estimate.unknown_input)
+        setattr(getattr(getattr(message, name), vector), axis, d)
     return message
-
-
-def _accel(outputs: Sequence[Output]) -> AccelStamped:
-    message = AccelStamped()
-    for output in outputs:
-        vector, axis = output.values['output_axis'].split('.')
-        setattr(getattr(message.accel, vector), axis, float(output.estimate.unknown_input))
-    return message
-
-
-MAKERS = {'joint_states': _joint_states, 'wrench': _wrench, 'accel': _accel}
 
 
 def check_axes(typed_outputs: Sequence[str], channels: Mapping[str, Mapping[str, Any]]) -> None:

@@ -28,9 +28,8 @@ from rclpy.qos import qos_check_compatible, QoSCompatibility
 from rclpy.serialization import deserialize_message
 
 DISCOVERY_PERIOD = 0.2
-MOST_WHYS = 3
-"""Different reasons that are told, of a publisher that always has another one."""
-STAMPS = {'source': 'source_timestamp', 'reception': 'received_timestamp'}
+MOST_TOLD = 3
+"""Different problems of messages that are told: a publisher may always have another one."""
 UNKNOWN = '_NODE_NAME_UNKNOWN_'
 """The name of a node that has been discovered later than its publisher, or is none of ROS."""
 Gid = tuple[int, ...]
@@ -42,51 +41,33 @@ class Listener:
     """
     Somebody who takes one number out of each message of a source.
 
-    `is_sample`: of y, not of a known input, which a message gives first. `field`, the `element` of
-    a list that is meant by name, and `stamps` (header, source or reception) are not known before
-    the topic's type; `error` says why its type has no such field. `lacking` messages were without
-    it; `why`: the latest one of them. `offset` is the time from the stamp of the latest message to
-    its publication (ns).
+    `is_sample`: of y, not of a known input, which a message gives first. `field` and `stamps`
+    (header, source or reception) are not known before the topic's type; `error` says why its type
+    has no such field. `lacking` messages were without it; `why`: the latest one of them.
     """
 
     def __init__(self, wanted: Input, take: Take, source: 'Source', is_sample: bool) -> None:
-        self._wanted, self._take = wanted, take
-        self.source, self.is_sample = source, is_sample
+        self._wanted, self.take, self.source, self.is_sample = wanted, take, source, is_sample
         self.field: Field | None = None
-        self.stamps = self.error = self.element = ''
-        self.lacking = self.offset = 0
+        self.value: Callable[[Any], float]
+        self.stamps = self.error = ''
+        self.lacking = 0
         self.why: MissingElementError | None = None
-        self._unwrap: Unwrapper | None = None
 
     def find(self, types: Mapping[str, Any], message_type: str) -> None:
         """Find its field in a message type, or keep the reason as `error`."""
         self.error, self.field = '', None
         try:
-            self.field = find_wanted(types, self._wanted._replace(message_type=message_type))
+            field = find_wanted(types, self._wanted._replace(message_type=message_type))
         except ConfigurationError as error:
             self.error = str(error)
             return
-        self.stamps, self.element = self._wanted.stamp, self.field.key
+        self.field, self.stamps, self.value = field, self._wanted.stamp, field.value
         if self.stamps == 'auto':
-            self.stamps = 'header' if self.field.header else 'source'
-        self._unwrap = Unwrapper() if self.field.wraps else None
-
-    def hear(self, message: Any, header: int, info: Mapping[str, Any]) -> bool:
-        """Pass the number in a message on, NaN if there is none; False if it lacks the number."""
-        value = math.nan
-        if message is not None and self.field is not None:
-            try:
-                value = self.field.value(message)
-            except MissingElementError as error:
-                self.lacking += 1
-                self.why = error.with_traceback(None)  # which holds the message
-                return False
-        if self._unwrap:
-            value = self._unwrap(value)
-        stamp = header if self.stamps == 'header' else info[STAMPS[self.stamps]]
-        self.offset = info['source_timestamp'] - stamp if stamp else 0
-        self._take(stamp, value)
-        return True
+            self.stamps = 'header' if field.header else 'source'
+        if field.wraps:
+            unwrap = Unwrapper()
+            self.value = lambda message: unwrap(field.value(message))
 
 
 class Source:
@@ -97,8 +78,8 @@ class Source:
     gid, `heard` are the names of nodes that can be heard; of the others `unheard` has a sentence
     that names the node and says what to do about it. `lost` and `damaged` count messages that did
     not arrive or are shorter than their type. `delay` is the longest time from a publication to
-    its callback between the latest two looks (ns). `on_names` is called with the names in each
-    message.
+    its callback between the latest two looks (ns), `offset` that from the latest header's stamp to
+    its publication. `on_names` is called with the names in each message.
     """
 
     def __init__(self, node: Node, sources: 'Sources', topic: str) -> None:
@@ -107,16 +88,16 @@ class Source:
         self.message_type = ''
         self.heard: dict[Gid, str] = {}
         self.unheard: dict[Gid, str] = {}
-        self.lost = self.damaged = 0
+        self.lost = self.damaged = self.offset = 0
         self.delay = self._delay = -math.inf
-        self.on_names: Callable[[list[str]], None] | None = None
+        self.on_names: Callable[[Any], None] | None = None
         self._sequence, self._mixed = 0, False
         self.listeners: list[Listener] = []
         self._served: list[Listener] = []  # those with a field
-        self._whys: set[str] = set()
-        self._subscribed = False
+        self._header = ''  # its name in a message
+        self._told: set[str] = set()
         self._nameless: set[Gid] = set()
-        self._told = ''
+        self._subscription: Any = None
         self._timer: Any = None
 
     def add(self, wanted: Input, take: Take, first: bool = False) -> Listener:
@@ -135,6 +116,38 @@ class Source:
             )
             self._discover()
 
+    def _discover(self) -> None:
+        """Take the type of the topic's publishers; say once why if that is not possible."""
+        found = self._node.get_publishers_info_by_topic(self.topic)
+        if not found:
+            return
+        try:
+            self._take_type(min(endpoint.topic_type for endpoint in found))
+        except (LookupError, RuntimeError) as error:  # not installed here; rcl's
+            for listener in self.listeners:
+                listener.error = f'{self.topic}: {error}'
+        if self._subscription:
+            self._node.destroy_timer(self._timer)
+            self._sources.on_type()
+        text = '; '.join(dict.fromkeys(li.error for li in self.listeners if li.error))
+        if text and text not in self._told:
+            self._told.add(text)
+            self._logger.error(text)
+
+    def _take_type(self, message_type: str) -> None:
+        """Find the fields in a message type, and subscribe if there is one."""
+        self._class, types = message_class(message_type), definitions(message_type)
+        for listener in self.listeners:
+            listener.find(types, message_type)
+        self._served = [listener for listener in self.listeners if listener.field]
+        self._header = next((li.field.header for li in self.listeners if li.field), '')
+        if self._subscription is None and (self._served or self.on_names):
+            self.message_type = message_type
+            self._subscription = subscribe_with_info(
+                self._node, self._class, self.topic, self._on_message, copy(SENSOR_QOS), raw=True,
+                qos_overriding_options=OVERRIDABLE,
+            )  # fmt: skip
+
     def look(self) -> None:
         """
         Look at the topic's publishers, and log what has changed.
@@ -142,7 +155,7 @@ class Source:
         The middleware has an event for incompatible QoS, but it does not name the publisher, and
         there is none for another message type. The ROS graph has both.
         """
-        if not self._subscribed:
+        if self._subscription is None:
             return
         self.delay, self._delay = self._delay, -math.inf
         before, told = self.heard, self.unheard
@@ -153,13 +166,12 @@ class Source:
                 self._nameless.add(gid)  # its node is usually known at the next look
                 continue
             name = f'{endpoint.node_namespace.rstrip("/")}/{endpoint.node_name}'
-            reason = self._mismatch(endpoint)
-            if not reason:
+            if reason := self._mismatch(endpoint):
+                self.unheard[gid] = f'{name} publishes {self.topic} unheard: {reason}'
+                if told.get(gid) != self.unheard[gid]:
+                    self._logger.error(self.unheard[gid])
+            else:
                 self.heard[gid] = name
-                continue
-            self.unheard[gid] = f'{name} publishes {self.topic} unheard: {reason}'
-            if told.get(gid) != self.unheard[gid]:
-                self._logger.error(self.unheard[gid])
         self._mixed = len(self.heard) > 1
         if self._mixed and self.heard.keys() != before.keys():
             names = ' and '.join(sorted(self.heard.values()))
@@ -171,72 +183,54 @@ class Source:
         """Return why a publisher can't be heard, '' if it can."""
         if endpoint.topic_type != self.message_type:
             return f'its type is {endpoint.topic_type}, expected {self.message_type}'
-        verdict, reason = qos_check_compatible(endpoint.qos_profile, self._qos)
+        own = self._subscription.qos_profile
+        verdict, reason = qos_check_compatible(endpoint.qos_profile, own)
         if verdict != QoSCompatibility.ERROR:
             return ''
         clashes = [part.removeprefix('ERROR: ') for part in reason.split(';') if 'ERROR' in part]
         hint = f'change qos_overrides.{self.topic}.subscription, or its own QoS'
         return f'{", ".join(clashes).lower()}; {hint}'
 
-    def _discover(self) -> None:
-        """Take the type of the topic's publishers; say once why if that is not possible."""
-        found = self._node.get_publishers_info_by_topic(self.topic)
-        if not found:
-            return
-        try:
-            self._take_type(min(endpoint.topic_type for endpoint in found))
-            problems = [listener.error for listener in self.listeners if listener.error]
-        except (LookupError, RuntimeError) as error:  # not installed here; rcl's
-            problems = [f'{self.topic}: {error}']
-            for listener in self.listeners:
-                listener.error = problems[0]
-        if self._subscribed:
-            self._node.destroy_timer(self._timer)
-            self._sources.on_type()
-        text = '; '.join(dict.fromkeys(problems))
-        if text and text != self._told:
-            self._logger.error(text)
-        self._told = text
-
-    def _take_type(self, message_type: str) -> None:
-        """Find the fields in a message type, and subscribe if there is one."""
-        kind, types = message_class(message_type), definitions(message_type)
-        for listener in self.listeners:
-            listener.find(types, message_type)
-        self._served = [listener for listener in self.listeners if listener.field]
-        if not self._subscribed and (self._served or self.on_names):
-            self._class, self.message_type, self._subscribed = kind, message_type, True
-            subscription = subscribe_with_info(
-                self._node, kind, self.topic, self._on_message, copy(SENSOR_QOS), raw=True,
-                qos_overriding_options=OVERRIDABLE,
-            )  # fmt: skip
-            self._qos = subscription.qos_profile
-
     def _on_message(self, data: bytes, info: Mapping[str, Any]) -> None:
-        self._delay = max(self._delay, time_ns() - info['source_timestamp'])
+        published = info['source_timestamp']
+        self._delay = max(self._delay, time_ns() - published)
         sequence = info['publication_sequence_number'] or 0  # 0: the middleware has none
         if 0 < sequence <= self._sequence:  # another publisher's
             self._mixed = True  # until `look` has seen how many there are
         elif sequence and self._sequence and not self._mixed:
             self.lost += sequence - self._sequence - 1
         self._sequence = sequence
-        message, header = None, 0
         try:
             message = deserialize_message(data, self._class)
         except RuntimeError:  # in a subscription that is not raw it would end the node
             self.damaged += 1
-        else:
-            names = getattr(message, 'name', None) if self.on_names else None
-            if names and isinstance(names, list):
-                self.on_names(names)
-            if self._served and self._served[0].field.header:  # type: ignore[union-attr]
-                header = self._served[0].field.stamp(message)  # type: ignore[union-attr]
-        lacking = [li for li in self._served if not li.hear(message, header, info)]
-        why = str(lacking[0].why) if lacking and len(self._whys) < MOST_WHYS else ''
-        if why and why not in self._whys:  # two publishers may alternate
-            self._whys.add(why)
-            more = f' (and {len(lacking) - 1} more like it)' if lacking[1:] else ''
-            self._logger.warning(f'a message on {self.topic} is left out: {why}{more}')
+            self._logger.warning(
+                f'a message on {self.topic} is damaged: left out', throttle_duration_sec=5.0
+            )
+            return
+        if self.on_names is not None:
+            self.on_names(getattr(message, 'name', None))
+        stamps = {'source': published, 'reception': info['received_timestamp']}
+        if self._header:
+            stamp = getattr(message, self._header).stamp
+            stamps['header'] = header = stamp.sec * 1_000_000_000 + stamp.nanosec
+            self.offset = published - header if header else 0
+        lacking = []
+        for listener in self._served:
+            try:
+                value = listener.value(message)
+            except MissingElementError as error:
+                lacking.append(listener)
+                listener.lacking += 1
+                listener.why = error.with_traceback(None)  # which holds the message
+            else:
+                listener.take(stamps[listener.stamps], value)
+        if lacking and len(self._told) < MOST_TOLD:
+            why = str(lacking[0].why)
+            if why not in self._told:
+                self._told.add(why)
+                more = f' (and {len(lacking) - 1} more like it)' if lacking[1:] else ''
+                self._logger.warning(f'a message on {self.topic} is left out: {why}{more}')
         self._sources.after_message()
 
 

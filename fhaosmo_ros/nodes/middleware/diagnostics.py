@@ -23,9 +23,9 @@ ERROR, STALE = DiagnosticStatus.ERROR, DiagnosticStatus.STALE
 class Report:
     """One status of /diagnostics, 'node: task': values, findings, and the worst level of these."""
 
-    def __init__(self, task: str) -> None:
+    def __init__(self, task: str, values: Mapping[str, Any] | None = None) -> None:
         self.task, self.level = task, OK
-        self.values: dict[str, Any] = {}
+        self.values = dict(values or {})
         self._findings: list[str] = []
 
     def find(self, level: bytes, text: str, when: object = True) -> None:

@@ -16,24 +16,33 @@ from builtin_interfaces.msg import Time
 from fhaosmo_ros.core.parameters.declaration import suggestion
 from fhaosmo_ros.messages.fields import ARRAY, BASE, NAME, SEQUENCE
 from numpy.typing import NDArray
-from std_msgs.msg import Float64MultiArray, MultiArrayDimension, MultiArrayLayout
+from std_msgs.msg import Float64MultiArray, MultiArrayDimension
 
 OTHER_NAMES = {'double': 'float64', 'float': 'float32', 'boolean': 'bool'}
 """IDL's names, which classes have, and those of ROS."""
 
 
 def labelled(names: list[str]) -> Callable[[NDArray], Float64MultiArray]:
-    """Return a function from doubles to a message whose label lists them, such as 'z1,z2,z3'."""
-    count = len(names)
-    dimension = MultiArrayDimension(label=','.join(names), size=count, stride=count)
-    layout = MultiArrayLayout(dim=[dimension])
-    return lambda values: Float64MultiArray(layout=layout, data=array('d', values.tobytes()))
+    """
+    Return a function from doubles to a message whose label lists them, such as 'z1,z2,z3'.
+
+    It is one message, filled again and again: to make one takes longer than a step.
+    """
+    count, message = len(names), Float64MultiArray()
+    message.layout.dim = [MultiArrayDimension(label=','.join(names), size=count, stride=count)]
+
+    def filled(values: NDArray) -> Float64MultiArray:
+        message.data = array('d', values.tobytes())
+        return message
+
+    return filled
 
 
 def time_message(stamp: int) -> Time:
     """Return a time in nanoseconds as a message."""
-    seconds, nanoseconds = divmod(stamp, 1_000_000_000)
-    return Time(sec=seconds, nanosec=nanoseconds)
+    message = Time()
+    message.sec, message.nanosec = divmod(stamp, 1_000_000_000)
+    return message
 
 
 def message_class(name: str) -> Any:
