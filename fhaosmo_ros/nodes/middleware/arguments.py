@@ -7,7 +7,7 @@ from itertools import pairwise
 import os
 import re
 import textwrap
-from typing import Any, NamedTuple
+from typing import Any
 
 from fhaosmo_ros import __version__
 from fhaosmo_ros.core.parameters.declaration import Parameter, shown, unknown_parameter
@@ -21,24 +21,18 @@ from rclpy.utilities import remove_ros_args
 USAGE = '[--ros-args [--params-file FILE] [-p NAME:=VALUE] [-r FROM:=TO] ...]'
 
 
-class Arguments(NamedTuple):
-    """What a command line says."""
-
-    given: dict[str, Any]  # parameters by name; neither names nor values are checked yet
-    origins: dict[str, str | None]  # the file of each of them, or None for the command line
-    rest: list[str]  # what is left for ROS: remappings, levels of the log
+Origins = dict[str, str | None]
+"""By the name of a parameter: the file that sets it, None for the command line."""
 
 
-def read_arguments(name: str, argv: list[str]) -> Arguments:
+def read_arguments(name: str, argv: list[str]) -> tuple[dict[str, Any], Origins, list[str]]:
     """
     Read the parameters of a node; those of the command line win over those of files.
 
-    Raises
-    ------
-    ConfigurationError
-        A file that can't be read, no section for the node but a similar one, a value that is no
-        YAML, or an argument that no node has.
-
+    Returns parameters by name, which are not checked yet, their origins, and the arguments that
+    are left for ROS, such as remappings. Raises ConfigurationError for a file that can't be read,
+    no section for the node but a similar one, a value that is no YAML, or an argument that no node
+    has.
     """
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
     parser.add_argument('--params-file', action='append', default=[])
@@ -50,7 +44,7 @@ def read_arguments(name: str, argv: list[str]) -> Arguments:
         raise ConfigurationError(str(error)) from None
     full_name = _full_name(name, rest)
     given: dict[str, Any] = {}
-    origins: dict[str, str | None] = {}
+    origins: Origins = {}
     for path in map(os.path.expanduser, found.params_file):
         values = read(path, full_name)
         if not values:
@@ -79,7 +73,7 @@ def read_arguments(name: str, argv: list[str]) -> Arguments:
         raise ConfigurationError(
             f'unexpected argument {others[0]!r}; usage: {name} {USAGE}; parameters: {name} --help'
         )
-    return Arguments(given, origins, rest)
+    return given, origins, rest
 
 
 def _full_name(name: str, arguments: list[str]) -> str:

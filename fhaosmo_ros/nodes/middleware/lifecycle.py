@@ -2,7 +2,7 @@
 """A managed node whose transitions may fail but never end the process."""
 
 from collections.abc import Callable
-import traceback
+from traceback import format_exception
 from typing import Any
 
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
@@ -10,7 +10,7 @@ from fhaosmo_ros.nodes.middleware.simulated_time import TimedNode
 from lifecycle_msgs.srv import ChangeState
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 
-SUCCESS, FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
+SUCCESS = TransitionCallbackReturn.SUCCESS
 
 
 class ManagedNode(LifecycleNode, TimedNode):
@@ -27,9 +27,8 @@ class ManagedNode(LifecycleNode, TimedNode):
         super().__init__(name, **options)
         self._error: Exception | None = None
         self._lasting: set[Any] = set()
-        # In rclpy 7.1 a transition that the state does not allow raises, and ends the spinning.
         service = next(s for s in self.services if s.service_name.endswith('/change_state'))
-        service.callback = self._guarded(service.callback)
+        self._rclpy_change_state, service.callback = service.callback, self._change_state
 
     @property
     def state(self) -> str:
@@ -76,13 +75,11 @@ class ManagedNode(LifecycleNode, TimedNode):
         return self._attempt(self.deactivate)
 
     def on_cleanup(self, before: LifecycleState) -> TransitionCallbackReturn:
-        """Inactive to unconfigured."""
-        return self._attempt(self.cleanup)
-
-    def on_shutdown(self, before: LifecycleState) -> TransitionCallbackReturn:
-        """Any state to finalized."""
+        """Inactive to unconfigured, or any state to finalized."""
         unconfigured = before.label == 'unconfigured'
         return self._attempt(self.deactivate if unconfigured else self.cleanup)
+
+    on_shutdown = on_cleanup
 
     def _attempt(
         self, action: Callable[[], None], undo: Callable[[], None] = lambda: None
@@ -92,7 +89,7 @@ class ManagedNode(LifecycleNode, TimedNode):
         except Exception as error:
             self._error = error
             undo()
-            return FAILURE
+            return TransitionCallbackReturn.FAILURE
         return SUCCESS
 
     def _entities(self) -> dict[Any, Callable[[Any], object]]:
@@ -106,25 +103,22 @@ class ManagedNode(LifecycleNode, TimedNode):
             **dict.fromkeys(self.timers, self.destroy_timer),
         }
 
-    def _guarded(self, callback: Callable[..., Any]) -> Callable[..., Any]:
-        def change_state(
-            request: ChangeState.Request, response: ChangeState.Response
-        ) -> ChangeState.Response:
-            self._error = None
-            before, wanted = self.state, request.transition.label or request.transition.id
-            try:
-                response = callback(request, response)
-            except RuntimeError:  # rcl's
-                response.success = False
-            if response.success:
-                self.get_logger().info(f'{before} -> {self.state}')
-            elif self._error is None:
-                self.get_logger().warning(f'transition {wanted} is not possible while {before}')
-            elif isinstance(self._error, ConfigurationError):
-                self.get_logger().error(f'transition {wanted} failed: {self._error}')
-            else:
-                text = ''.join(traceback.format_exception(self._error))
-                self.get_logger().error(f'transition {wanted} failed: {text}')
-            return response
-
-        return change_state
+    def _change_state(self, request: ChangeState.Request, response: Any) -> Any:
+        """Do what rclpy's service does, and log how it went."""
+        self._error, log = None, self.get_logger()
+        before, wanted = self.state, request.transition.label or request.transition.id
+        try:
+            response = self._rclpy_change_state(request, response)
+        except (
+            RuntimeError
+        ):  # in rclpy 7.1 for what the state does not allow; it ends the spinning
+            response.success = False
+        if response.success:
+            log.info(f'{before} -> {self.state}')
+        elif self._error is None:
+            log.warning(f'transition {wanted} is not possible while {before}')
+        else:
+            defect = not isinstance(self._error, ConfigurationError)
+            text = ''.join(format_exception(self._error)) if defect else self._error
+            log.error(f'transition {wanted} failed: {text}')
+        return response

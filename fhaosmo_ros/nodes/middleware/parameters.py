@@ -8,24 +8,26 @@ from fhaosmo_ros.core.parameters.declaration import Parameter, Parameters, shown
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.files import is_built_in
 from fhaosmo_ros.core.parameters.per_channel import followers
-from rcl_interfaces.msg import (
-    FloatingPointRange,
-    IntegerRange,
-    ParameterDescriptor,
-    SetParametersResult,
-)
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.exceptions import ParameterNotDeclaredException
 from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 
-TYPES = {
-    'bool': RosParameter.Type.BOOL,
-    'int': RosParameter.Type.INTEGER,
-    'double': RosParameter.Type.DOUBLE,
-    'string': RosParameter.Type.STRING,
-    'double_array': RosParameter.Type.DOUBLE_ARRAY,
-    'string_array': RosParameter.Type.STRING_ARRAY,
-}
+
+class RefusedError(ParameterNotDeclaredException):
+    """
+    A change that is refused, with the reason as its whole text.
+
+    Of what a callback raises, this is the kind that rclpy answers to who has asked for the change.
+    """
+
+    def __init__(self, reason: str) -> None:
+        Exception.__init__(self, reason)
+
+
+def type_of(parameter: Parameter) -> RosParameter.Type:
+    """Return the ROS type of a declared parameter."""
+    return RosParameter.Type[{'int': 'INTEGER'}.get(parameter.kind, parameter.kind.upper())]
 
 
 def descriptor(parameter: Parameter, read_only: bool) -> ParameterDescriptor:
@@ -35,18 +37,18 @@ def descriptor(parameter: Parameter, read_only: bool) -> ParameterDescriptor:
     Typing is dynamic so that a wrong type reaches our own check, whose message names the
     parameter. Bounds are a ROS range only where a slider of rqt_reconfigure makes sense.
     """
-    constraints = [parameter.allowed]
-    if parameter.lengths:
-        constraints.append(parameter.lengths)
-    if parameter.logarithmic:
-        constraints.append('logarithmic scale: change it by a factor')
-    if not parameter.live and not read_only:
-        constraints.append('fixed while the node is configured: set it after cleanup')
+    fixed = not parameter.live and not read_only
+    constraints = (
+        parameter.allowed,
+        parameter.lengths,
+        'logarithmic scale: change it by a factor' if parameter.logarithmic else '',
+        'fixed while the node is configured: set it after cleanup' if fixed else '',
+    )
     result = ParameterDescriptor(
         name=parameter.name,
-        type=TYPES[parameter.kind].value,
+        type=type_of(parameter).value,
         description=parameter.text,
-        additional_constraints='; '.join(constraints),
+        additional_constraints='; '.join(filter(None, constraints)),
         read_only=read_only,
         dynamic_typing=True,
     )
@@ -60,10 +62,11 @@ def descriptor(parameter: Parameter, read_only: bool) -> ParameterDescriptor:
 
 def built_in(given: Mapping[str, Any]) -> list[RosParameter]:
     """Return those given parameters that are rclpy's own, such as use_sim_time."""
-    for name, value in given.items():
-        if is_built_in(name) and not isinstance(value, bool | int | float | str):
+    own = {name: value for name, value in given.items() if is_built_in(name)}
+    for name, value in own.items():
+        if not isinstance(value, bool | int | float | str):
             raise ConfigurationError(f"parameter '{name}': expected one value, got {shown(value)}")
-    return [RosParameter(name, value=v) for name, v in given.items() if is_built_in(name)]
+    return [RosParameter(name, value=value) for name, value in own.items()]
 
 
 class NodeParameters:
@@ -71,8 +74,8 @@ class NodeParameters:
     The parameters of a node: declared in ROS, and changed by its services.
 
     ROS has a copy of the values for its services; the node reads these ones. A live change is
-    coerced and prepared as a set when it comes in (pre-set callback), refused or accepted before
-    ROS takes it (on-set callback), and adopted afterwards (post-set callback).
+    coerced, prepared and perhaps refused as a set before ROS takes it (pre-set callback), and
+    adopted afterwards (post-set callback).
 
     Parameters
     ----------
@@ -97,15 +100,11 @@ class NodeParameters:
         adopt: Callable[[Any], None],
         fixed: Iterable[str] | None = None,
     ) -> None:
-        self.values = values
-        self._node = node
-        self._prepare, self._adopt_change = prepare, adopt
+        self._node, self._prepare, self._adopt_change = node, prepare, adopt
         not_live = (name for name, parameter in values.table.items() if not parameter.live)
         self._read_only = set(not_live if fixed is None else fixed)
-        self._refused: ConfigurationError | None = None
         self.extend(values)
         node.add_pre_set_parameters_callback(self._look_at)
-        node.add_on_set_parameters_callback(self._check)
         node.add_post_set_parameters_callback(self._adopt)
 
     def extend(self, values: Parameters) -> None:
@@ -122,34 +121,27 @@ class NodeParameters:
         for name in found:
             if not self._node.has_parameter(name):  # rclpy 7.1 refuses it too, without the name
                 raise ParameterNotDeclaredException(f"'{name}'{suggestion(name, table)}")
-        self._refused, ours = None, [name for name in found if name in table]
+        ours = [name for name in found if name in table]
+        if not ours or self._read_only & found.keys():  # which rclpy refuses
+            return parameters
         try:
-            self._coerced = {name: table[name].coerce(found[name].value) for name in ours}
+            changes = {name: table[name].coerce(found[name].value) for name in ours}
             for name in ours:
                 for own in followers(name, self.values):
-                    self._coerced.setdefault(own, self._coerced[name])
-            if ours:
-                self._next = Parameters(table, {**self.values, **self._coerced})
-                self._prepared = self._prepare(self._next, self._coerced)
+                    changes.setdefault(own, changes[name])
+            values = Parameters(table, {**self.values, **changes})
+            self._next = values, changes, self._prepare(values, changes)
         except ConfigurationError as error:
-            self._refused = error
-            return parameters
-        for name, value in self._coerced.items():
-            found[name] = RosParameter(name, TYPES[table[name].kind], value)
-        return list(found.values())
-
-    def _check(self, parameters: list[RosParameter]) -> SetParametersResult:
-        ours = [p.name for p in parameters if p.name in self.values.table]
-        if not ours or self._refused is None:
-            return SetParametersResult(successful=True)
-        self._node.get_logger().warning(f'rejected: {self._refused}')
-        for name in ours:  # rclpy has already put the rejected type there
-            self._node.describe_parameter(name).type = TYPES[self.values.table[name].kind].value
-        return SetParametersResult(successful=False, reason=str(self._refused))
+            self._node.get_logger().warning(f'rejected: {error}')
+            raise RefusedError(str(error)) from None
+        coerced = {
+            name: RosParameter(name, type_of(table[name]), v) for name, v in changes.items()
+        }
+        return list({**found, **coerced}.values())
 
     def _adopt(self, parameters: list[RosParameter]) -> None:
         if any(p.name in self.values.table for p in parameters):
-            self.values = self._next
-            self._adopt_change(self._prepared)
-            text = ', '.join(f'{name} = {value}' for name, value in self._coerced.items())
+            self.values, changes, prepared = self._next
+            self._adopt_change(prepared)
+            text = ', '.join(f'{name} = {value}' for name, value in changes.items())
             self._node.get_logger().info(f'set {text}')
