@@ -4,6 +4,7 @@
 from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
+from functools import cache, partial
 import shlex
 from time import time_ns
 from typing import Any
@@ -40,27 +41,22 @@ class PrivateNode(Spinner):
     """
     A `node` in a context of its own, without signal handlers; spun while open.
 
-    Parameters
-    ----------
-    name : str
-    ros_arguments : sequence of str
-        What follows ``--ros-args``, as launch gives it to every node: names, remappings, enclave.
-
+    `ros_arguments` are what launch gives to every node behind ``--ros-args``: names, remappings,
+    enclave. For `grace` see `Spinner`.
     """
 
-    grace: float | None = GRACE
-
-    def __init__(self, name: str, ros_arguments: Sequence[str] = ()) -> None:
-        self._context = Context()
-        self._clients: dict[str, AsyncParameterClient] = {}
-        given = ['--ros-args', *ros_arguments]
+    def __init__(
+        self, name: str, ros_arguments: Sequence[str] = (), grace: float | None = GRACE
+    ) -> None:
+        self._context, given = Context(), ['--ros-args', *ros_arguments]
         no_handlers = SignalHandlerOptions.NO
         try:
             rclpy.init(args=given, context=self._context, signal_handler_options=no_handlers)
             self.node = Node(name, context=self._context)
         except RuntimeError as error:
             raise ConfigurationError(f'ROS arguments {shlex.join(given)}: {error}') from None
-        super().__init__(self.node, grace=self.grace)
+        self._client = cache(partial(AsyncParameterClient, self.node))  # by the name of its node
+        super().__init__(self.node, grace=grace)
 
     def __exit__(self, *error: object) -> None:
         super().__exit__(*error)
@@ -80,23 +76,10 @@ class PrivateNode(Spinner):
         """
         return bool(self._client(node).services_are_ready())
 
-    def _client(self, node: str) -> AsyncParameterClient:
-        if node not in self._clients:
-            self._clients[node] = AsyncParameterClient(self.node, node)
-        return self._clients[node]
-
     def publisher(
         self, topic: str, message_type: str, transient_local: bool
     ) -> Callable[[bytes], None]:
-        """
-        Return a function that publishes messages in CDR.
-
-        Raises
-        ------
-        LookupError
-            The message type is not installed here.
-
-        """
+        """Return a function that publishes messages in CDR; LookupError for an unknown type."""
         qos = QoSProfile(depth=PLAYED_DEPTH)
         if transient_local:
             qos.durability = DurabilityPolicy.TRANSIENT_LOCAL
@@ -134,8 +117,6 @@ class TopicRecorder(PrivateNode):
 
     """
 
-    grace = None  # what is being written is written before the bag is closed
-
     def __init__(
         self,
         bag: Any,
@@ -144,7 +125,8 @@ class TopicRecorder(PrivateNode):
         everything: bool = False,
         ros_arguments: Sequence[str] = (),
     ) -> None:
-        super().__init__('fhaosmo_recorder', ros_arguments)
+        # Without a limit of time, what is being written is written before the bag is closed.
+        super().__init__('fhaosmo_recorder', ros_arguments, grace=None)
         self.counts: Counter[str] = Counter()
         self.lost: Counter[str] = Counter()
         self.problems: list[str] = []
@@ -218,17 +200,17 @@ class TopicRecorder(PrivateNode):
         numbered = len(profiles) == 1 and topic not in SHARED
         # Measured samples keep their stamps, even those of a clock that is wrong.
         earliest = self._begin - OLD if latched and not measured else 0
-        latest = 0
+        before = 0
 
         def receive(data: bytes, info: Mapping[str, int]) -> None:
-            nonlocal latest
-            number = info.get('publication_sequence_number') or 0 if numbered else 0
-            if latest and number > latest + 1:
-                self.lost[topic] += number - latest - 1
-            elif 0 < number <= latest:  # another publisher: its numbers say nothing
+            nonlocal before, numbered
+            number = info['publication_sequence_number'] or 0  # 0: the middleware has none
+            if 0 < number <= before:  # another publisher: its numbers say nothing
+                numbered = False
                 self.lost.pop(topic, None)
-                number = 2**63
-            latest = max(latest, number)
+            elif numbered and before and number > before + 1:
+                self.lost[topic] += number - before - 1
+            before = number
             stamp = info['source_timestamp'] or info['received_timestamp']
             stamp = stamp if stamp >= earliest else self._begin
             self._write(self._bag.write, topic, stamp, data)
