@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The estimator node: a managed node (ROS 2 lifecycle) of one channel or many."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
+from textwrap import shorten
 from typing import Any
 
 from fhaosmo_ros.core.online.estimator import Change, OnlineEstimator
@@ -11,6 +12,7 @@ from fhaosmo_ros.core.parameters.declaration import Parameters, suggestion, Valu
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.files import complete
 from fhaosmo_ros.core.parameters.per_channel import (
+    channel_names,
     CHANNELS,
     FROM_JOINTS,
     of_channel,
@@ -19,8 +21,8 @@ from fhaosmo_ros.core.parameters.per_channel import (
 )
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
 from fhaosmo_ros.inputs import known_inputs, measured_output, with_joints
+from fhaosmo_ros.messages.fields import listed
 from fhaosmo_ros.nodes.estimator.channel import Channel
-from fhaosmo_ros.nodes.estimator.joints import choose, left_out
 from fhaosmo_ros.nodes.estimator.outputs import check_axes, parameter_text, TypedOutputs
 from fhaosmo_ros.nodes.estimator.sources import check_inputs, Sources
 from fhaosmo_ros.nodes.middleware.diagnostics import (
@@ -31,11 +33,11 @@ from fhaosmo_ros.nodes.middleware.diagnostics import (
     STALE,
     WARN,
 )
-from fhaosmo_ros.nodes.middleware.endpoints import check_overrides, set_period
+from fhaosmo_ros.nodes.middleware.endpoints import check_overrides, full_name, set_period
 from fhaosmo_ros.nodes.middleware.lifecycle import ManagedNode
 from fhaosmo_ros.nodes.middleware.parameters import built_in, NodeParameters
 from fhaosmo_ros.nodes.middleware.spin import run_node
-from fhaosmo_ros.topics import estimates_of, EVENT, PARAMETERS
+from fhaosmo_ros.topics import estimates_of, EVENT, PARAMETERS, STANDARD_DEVIATION
 from rclpy.parameter import Parameter as RosParameter
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_msgs.msg import String
@@ -62,10 +64,7 @@ class EstimatorNode(ManagedNode):
             given['sampling'] = 'clock'
         values = complete(with_joints(given), ESTIMATOR_PARAMETERS)
         super().__init__(
-            'estimator',
-            parameter_overrides=built_in(given),
-            enable_logger_service=True,
-            **options,
+            'estimator', parameter_overrides=built_in(given), enable_logger_service=True, **options
         )
         self._given = given
         self._names: list[str] = values[CHANNELS]
@@ -82,9 +81,7 @@ class EstimatorNode(ManagedNode):
                 self.start()
             else:
                 self._make_estimators()  # bad parameters end the node in any case
-                self.get_logger().info(
-                    'waiting to be configured, for instance by ros2 lifecycle set'
-                )
+                self.get_logger().info('waiting to be configured, as by ros2 lifecycle set')
         except Exception:
             self.destroy_node()
             raise
@@ -164,26 +161,26 @@ class EstimatorNode(ManagedNode):
                 "of /clock, so dt is in the host's time; set sampling to clock for simulation time"
             )
 
-    def _take_joints(self, names: list[str]) -> None:
+    def _take_joints(self, names: Any) -> None:
         """Make the channels from the first names; later, report once those that are new."""
-        present = self._node_parameters.values
-        if self._names != FROM_JOINTS:
-            late = [name for name in names if name not in self._joints]
-            if late:
-                self._sources.of(measured_output(present)).on_names = None
-                text = f'{left_out(late)} after the first message; start the node again to take it'
-                self._left_out = '; '.join(filter(None, [self._left_out, text]))
-                self.get_logger().warning(text)
+        if not isinstance(names, list) or self._joints.issuperset(names):  # at 1 kHz
             return
-        self._joints = set(names)
-        fit, others = choose(self, names, present['max_channels'])
+        present, log = self._node_parameters.values, self.get_logger()
+        if self._names != FROM_JOINTS:
+            self._sources.of(measured_output(present)).on_names = None
+            late = left_out([name for name in names if name not in self._joints])
+            text = f'{late} after the first message; start the node again to take it'
+            self._left_out = '; '.join(filter(None, [self._left_out, text]))
+            log.warning(text)
+            return
+        fit, others = self._choose(names, present['max_channels'])
         if others not in ('', self._left_out):
-            self.get_logger().error(others, throttle_duration_sec=5.0)
+            log.error(others, throttle_duration_sec=5.0)
         self._left_out = others
         if not fit:
             return
         for name in set(with_own_parameters(present[CHANNELS], present)) - set(fit):
-            self.get_logger().error(
+            log.error(
                 f"parameters of '{name}' are not used: there is no such joint"
                 f'{suggestion(name, fit)}'
             )
@@ -191,17 +188,41 @@ class EstimatorNode(ManagedNode):
             **{k: v for k, v in present.items() if (split(k)[0] or fit[0]) in fit},
             CHANNELS: fit,
         }, ESTIMATOR_PARAMETERS)  # fmt: skip
-        self._names = fit
+        self._names, self._joints = fit, set(names)
         self._node_parameters.extend(values)
         try:
             self._make_channels(self._make_estimators())
         except ConfigurationError as error:
-            self.get_logger().error(str(error))
+            log.error(str(error))
             return
         self._publish_parameters()
-        self.get_logger().info(f'channels: {", ".join(fit)}')
+        log.info(f'channels: {", ".join(fit)}')
         if self.state == 'active':
             self.activate()
+
+    def _choose(self, names: Iterable[str], most: int) -> tuple[list[str], str]:
+        """Return the names that become channels, at most so many, and what is said of others."""
+        fit: list[str] = []
+        bad: dict[str, str] = {}
+        for name in dict.fromkeys(names):
+            try:
+                channel_names({CHANNELS: [name or '?']})  # '' is no channel's name
+                full_name(self, f'~/{name}/{STANDARD_DEVIATION}')  # its longest topic
+                fit.append(name)
+            except ConfigurationError as error:
+                bad[name] = shorten(str(error), 200)
+        said = []
+        if bad:
+            said.append(
+                f"{left_out(bad)} can't be the name of a channel ({next(iter(bad.values()))}); "
+                'name a channel and set its input_field to position[NAME]'
+            )
+        if fit[most:]:
+            said.append(
+                f'{left_out(fit[most:])} beyond max_channels ({most}); raise it, or name in '
+                'channels those that are to be estimated'
+            )
+        return fit[:most], '; '.join(said)
 
     def activate(self) -> None:
         """Take samples and publish."""
@@ -265,11 +286,9 @@ class EstimatorNode(ManagedNode):
         state = Report('state')
         active = self.state == 'active'
         state.find(OK if active else STALE, self.state)
-        timeless = (
-            self.get_parameter('use_sim_time').value and not self.get_clock().now().nanoseconds
-        )
-        clock = self.resolve_topic_name('/clock')
-        state.find(ERROR, f'use_sim_time, but nothing on {clock} yet', timeless)
+        if self.get_parameter('use_sim_time').value and not self.get_clock().now().nanoseconds:
+            clock = self.resolve_topic_name('/clock')
+            state.find(ERROR, f'use_sim_time, but nothing on {clock} yet')
         waits = active and not self._channels
         state.find(STALE, 'no message with the names of the joints yet', waits)
         state.find(WARN, self._left_out, self._left_out)
@@ -288,6 +307,12 @@ def naming_channel(name: str) -> Iterator[None]:
         if not name:
             raise
         raise ConfigurationError(f"channel '{name}': {error}") from None
+
+
+def left_out(names: Collection[str]) -> str:
+    """Return in words that joints are left out."""
+    count = 'joint' if len(names) == 1 else f'{len(names)} joints'
+    return f'left out: {count} {listed(map(repr, names))}'
 
 
 def main(argv: list[str] | None = None) -> int:
