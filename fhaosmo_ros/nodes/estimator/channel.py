@@ -5,7 +5,6 @@ from collections.abc import Mapping
 from functools import partial
 from math import isfinite, isnan
 from time import perf_counter
-from typing import Any
 
 from builtin_interfaces.msg import Time
 from fhaosmo_ros.core.observer.status import AFRESH, JUMPED, REJECTED, Status, UNUSED
@@ -16,7 +15,7 @@ from fhaosmo_ros.core.parameters.declaration import Parameters
 from fhaosmo_ros.core.parameters.units import derivative_unit
 from fhaosmo_ros.inputs import known_inputs, measured_output, Pairing
 from fhaosmo_ros.nodes.estimator.health import Health
-from fhaosmo_ros.nodes.estimator.outputs import Output, Outputs, TypedOutputs
+from fhaosmo_ros.nodes.estimator.outputs import Outputs, TypedOutputs
 from fhaosmo_ros.nodes.estimator.sources import Listener, Sources
 from fhaosmo_ros.nodes.middleware.diagnostics import array_of, OK, Report, WARN
 from fhaosmo_ros.nodes.middleware.endpoints import create_publisher
@@ -67,7 +66,7 @@ class Channel:
     ) -> None:
         self._node, self._typed, self.name = node, typed, name
         self._clock = node.get_clock()
-        self._logger = node.get_logger().get_child(name) if name else node.get_logger()
+        self.logger = node.get_logger().get_child(name) if name else node.get_logger()
         self.estimator, observer = estimator, estimator.observer
         self._use(values)
         self._active = False
@@ -87,14 +86,12 @@ class Channel:
             self.u[u] = sources.of(its).add(its, take, first=True)
         self.simulated = node.get_parameter('use_sim_time').value
         self._health = Health(self)
-        if name:  # those without a name are the node's
-            node.create_service(Trigger, prefix + 'reset', self.reset)
-            node.create_service(SetBool, prefix + 'freeze', self.freeze)
 
     def _use(self, values: Parameters) -> None:
         self.values = values
         self._by_clock = values['sampling'] == 'clock'
         self._on_samples = values['publish_on'] == 'sample'
+        self._longest_wait = values['known_input_wait']
 
     def _forget(self) -> None:
         self._arrived = False
@@ -106,7 +103,7 @@ class Channel:
 
     def activate(self) -> None:
         """Take samples and publish from now on; the first sample starts the observer afresh."""
-        self._reset()
+        self.reset()
         self._forget()
         self.pairing.forget_samples()
         self._health.begin()
@@ -114,7 +111,7 @@ class Channel:
         if self.estimator.events.on:
             self._say('no event yet')
         observer = self.estimator.observer
-        self._logger.info(
+        self.logger.info(
             f'estimating {observer.order} states and the unknown input from '
             f'{self.y.source.topic} ({observer.description})'
         )
@@ -139,7 +136,7 @@ class Channel:
             self._without_sample += 1
             # What is wrong with y itself has been logged already.
             if self._without_sample == TOLD_AFTER and not self.y.error:
-                self._logger.warning(f'still waiting: {reports[0].text}')
+                self.logger.warning(f'still waiting: {reports[0].text}')
         return reports
 
     def _on_input(self, index: int, name: str, stamp: int, u: float) -> None:
@@ -147,7 +144,7 @@ class Channel:
             self.pairing.take_input(index, stamp, u)
             self._take_paired()
         elif not self.estimator.set_input(u, index):
-            self._logger.warning(
+            self.logger.warning(
                 f'rejected {name} = {u}: expected a finite number; the last one is held',
                 throttle_duration_sec=QUIET,
             )
@@ -197,13 +194,12 @@ class Channel:
         if estimate is not None:
             self._outputs.publish(estimate, stamp)
             name = self.name or (self.y.field and self.y.field.key) or 'y'
-            self._typed.add(Output(name, stamp, estimate, self.values))
+            self._typed.add(name, stamp, estimate, self.values)
 
     def tick(self) -> None:
         """Publish at the node's rate, if it is to; log once that y is silent."""
-        waits, wait = self.pairing.by_stamp, self.values['known_input_wait']
-        if waits and perf_counter() - self._waits_since > wait:  # and no sample follows
-            self._take_paired(at_once=True)
+        if self.pairing.by_stamp and perf_counter() - self._waits_since > self._longest_wait:
+            self._take_paired(at_once=True)  # no sample follows that would release these
         if self._arrived:
             self._arrived = self._stale = False
             self._silent_since = None
@@ -213,7 +209,7 @@ class Channel:
                 self._silent_since = now
             elif not 0 <= now - self._silent_since <= longest * 1e9:  # or it jumped back
                 self._stale = True
-                self._logger.warning(
+                self.logger.warning(
                     f'no usable sample on {self.y.source.topic} for {longest:.3g} s: not '
                     'publishing until one comes',
                     throttle_duration_sec=QUIET,
@@ -239,13 +235,11 @@ class Channel:
             y=y, late=late, jumped=jumped, restarts=counters.restarts, **counters._asdict()
         )
         if flag == Status.DIVERGED:
-            self._logger.error(text)
+            self.logger.error(text)
         elif flag & NEWS:
-            self._logger.warning(text)
+            self.logger.warning(text)
         else:
-            self._logger.warning(
-                f'rejected a sample: {text} ({counters.rejected} rejected so far)'
-            )
+            self.logger.warning(f'rejected a sample: {text} ({counters.rejected} rejected so far)')
 
     def _tell_events(self) -> None:
         """Publish, and log, the events that have begun or ended."""
@@ -254,7 +248,7 @@ class Channel:
             text, values = described(event, unit)
             self._say(text, time_message(event.stamp), WARN if event.begins else OK, values)
             if event.begins:
-                self._logger.warning(f'event: {text}', throttle_duration_sec=QUIET)
+                self.logger.warning(f'event: {text}', throttle_duration_sec=QUIET)
 
     def _say(
         self, text: str, stamp: Time | None = None, level: bytes = OK,
@@ -266,23 +260,14 @@ class Channel:
         stamp = stamp or self._clock.now().to_msg()
         self._events.publish(array_of(self._node, stamp, [report], self.values['hardware_id']))
 
-    def _reset(self) -> None:
+    def reset(self, _: Trigger.Request | None = None) -> str:
+        """Start the observer afresh with the next sample; return what has been done."""
         self.estimator.reset()
         self._outputs.snapshot(Flag.RESET)
+        return 'the observer starts afresh with the next sample'
 
-    def reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        """Start the observer afresh with the next sample."""
-        self._reset()
-        return self._done('reset', 'the observer starts afresh with the next sample', response)
-
-    def freeze(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
-        """Hold gamma, or let it adapt again."""
+    def freeze(self, request: SetBool.Request) -> str:
+        """Hold gamma, or let it adapt again; return what has been done."""
         self.estimator.freeze(request.data)
         self._outputs.snapshot(Flag.CHANGED)
-        text = 'gamma is held' if request.data else 'gamma adapts again'
-        return self._done('freeze', text, response)
-
-    def _done(self, service: str, text: str, response: Any) -> Any:
-        response.success, response.message = True, text
-        self._logger.info(f'{service}: {text}')
-        return response
+        return 'gamma is held' if request.data else 'gamma adapts again'

@@ -26,13 +26,15 @@ RATE_RATIO = 1.5
 """Factor between the rate of y and that of the gains that deserves one."""
 SPREAD = 3.0
 """Factor between the innovations and those expected that deserves one."""
-UNPAIRED = {
-    'late inputs': ', which came after their sample had been used: raise known_input_wait, or '
-    'their header stamps are of another clock',
-    'samples before any input': ', whose stamps are all later: are the header stamps of one '
-    'clock?',
+COUNTED = {
+    'restarts': 'restarts {}',
+    'stuck': 'stuck {}',
+    'late inputs': '{} late inputs, which came after their sample had been used: raise '
+    'known_input_wait, or their header stamps are of another clock',
+    'samples before any input': '{} samples before any input, whose stamps are all later: are the '
+    'header stamps of one clock?',
 }
-"""What is said of known inputs and samples that do not find each other."""
+"""What is said of the input where these counters have grown."""
 
 
 def _words(name: str) -> str:
@@ -144,9 +146,10 @@ class Health:
         report.find(WARN, several, len(heard) > 1 and not lacking)
         report.find(WARN, f'{lacking} messages without y: {y.why}', lacking and not used)
         bad = {key: news[key] for key in UNUSED if news[key]}
-        most_are_bad = sum(bad.values()) > BAD_SHARE * (sum(bad.values()) + used)
-        level = ERROR if most_are_bad else WARN
-        report.find(level, ', '.join(f'{key} {n}' for key, n in bad.items()), bad)
+        many = sum(bad.values()) > BAD_SHARE * (sum(bad.values()) + used)
+        report.find(
+            ERROR if many else WARN, ', '.join(f'{key} {n}' for key, n in bad.items()), bad
+        )
         spread = news['spread stamps']
         report.find(
             WARN,
@@ -154,8 +157,6 @@ class Health:
             "times inexact: let it tick with each, or do not use sampling 'clock'",
             used < 2 * spread,
         )
-        for key in ('restarts', 'stuck'):
-            report.find(WARN, f'{key} {news[key]}', news[key])
         report.find(WARN, f'sample rate {rate:.4g} Hz', rate < limits['warn_rate_below'])
         report.find(WARN, f'jitter {jitter:.3g}', jitter > limits['warn_jitter_above'])
         latest = limits['warn_delay_above']
@@ -173,8 +174,8 @@ class Health:
                 report.find(WARN, text)
             nobody = not u.source.heard and not u.source.unheard
             report.find(WARN, f'no publisher of {name}', nobody)
-        for key, text in UNPAIRED.items():
-            report.find(WARN, f'{news[key]} {key}{text}', news[key])
+        for key, text in COUNTED.items():
+            report.find(WARN, text.format(news[key]), news[key])
         return report
 
     def _observer(self, seen: Seen) -> Report:

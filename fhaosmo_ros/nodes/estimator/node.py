@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The estimator node: a managed node (ROS 2 lifecycle) of one channel or many."""
 
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
 from textwrap import shorten
@@ -142,8 +142,11 @@ class EstimatorNode(ManagedNode):
             for name, estimator in estimators.items()
         ]
         self._sources.after_message = self._typed.publish
-        self.create_service(Trigger, '~/reset', partial(self._each_answers, 'reset'))
-        self.create_service(SetBool, '~/freeze', partial(self._each_answers, 'freeze'))
+        of_prefix = {f'~/{channel.name}/': [channel] for channel in self._channels if channel.name}
+        for prefix, channels in {**of_prefix, '~/': self._channels}.items():
+            for kind, act in ((Trigger, Channel.reset), (SetBool, Channel.freeze)):
+                answer = partial(self._answer, channels, act)
+                self.create_service(kind, prefix + act.__name__, answer)
         self._sources.open()
 
     def _found_type(self) -> None:
@@ -248,9 +251,13 @@ class EstimatorNode(ManagedNode):
             channel.tick()
         self._typed.publish()
 
-    def _each_answers(self, name: str, request: Any, response: Any) -> Any:
-        for channel in self._channels:
-            getattr(channel, name)(request, response)
+    def _answer(
+        self, channels: Iterable[Channel], act: Callable[..., str], request: Any, response: Any
+    ) -> Any:
+        """Answer a service by what channels do, who say it in one sentence."""
+        for channel in channels:
+            response.success, response.message = True, act(channel, request)
+            channel.logger.info(f'{act.__name__}: {response.message}')
         return response
 
     def _prepare(

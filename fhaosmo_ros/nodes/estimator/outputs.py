@@ -6,6 +6,7 @@ from math import nan
 from time import perf_counter
 from typing import Any, NamedTuple
 
+from builtin_interfaces.msg import Time
 from fhaosmo_ros.core.model.triangular import TriangularModel
 from fhaosmo_ros.core.observer.estimates import Estimate, TUNING
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
@@ -48,19 +49,19 @@ class Outputs:
             'state': lambda estimate, _: state(estimate.z),
             'unknown_input': lambda estimate, _: self._number(estimate.unknown_input),
             'innovation': lambda estimate, _: innovation(estimate.innovation),
-            'stamp': lambda _, stamp: time_message(stamp),
+            'stamp': lambda _, stamp: time_message(stamp, self._time),
         }
         self._listeners = Listeners({
             name: create_publisher(node, message_class(kind), prefix + name)
             for name, kind in estimates_of(observer.parameters).items()
         })  # fmt: skip
-        self._float = Float64()
+        self._float, self._time = Float64(), Time()  # copied by `publish`, and filled again
         self._period = PERIOD_OF_SELF_TUNING if observer.self_tuning else PERIOD
         self.due, self._labels = 0.0, ['']
         self._snapshots = node.create_publisher(message_class(ARRAY), prefix + SNAPSHOT, LATCHED)
 
     def _number(self, value: float) -> Float64:
-        self._float.data = value  # it has been copied when `publish` returns
+        self._float.data = value
         return self._float
 
     def publish(self, estimate: Estimate, stamp: int) -> None:
@@ -115,11 +116,12 @@ class TypedOutputs:
             if name != 'none'
         })  # fmt: skip
 
-    def add(self, output: Output) -> None:
-        """Let an estimate wait for those of other channels."""
-        if output.name in self._waiting:  # several samples had waited for their known inputs
-            self.publish()
-        self._waiting[output.name] = output
+    def add(self, name: str, stamp: int, estimate: Estimate, values: Mapping[str, Any]) -> None:
+        """Let an estimate wait for those of other channels, if anybody listens."""
+        if self._listeners.heard():
+            if name in self._waiting:  # several samples had waited for their known inputs
+                self.publish()
+            self._waiting[name] = Output(name, stamp, estimate, values)
 
     def publish(self) -> None:
         """Publish the estimates that wait, with the latest of their stamps."""

@@ -62,7 +62,7 @@ class Listener:
         except ConfigurationError as error:
             self.error = str(error)
             return
-        self.field, self.stamps, self.value = field, self._wanted.stamp, field.value
+        self.field, self.stamps, self.value = field, self._wanted.stamp, field.reader()
         if self.stamps == 'auto':
             self.stamps = 'header' if field.header else 'source'
         if field.wraps:

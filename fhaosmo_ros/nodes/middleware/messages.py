@@ -38,9 +38,9 @@ def labelled(names: list[str]) -> Callable[[NDArray], Float64MultiArray]:
     return filled
 
 
-def time_message(stamp: int) -> Time:
-    """Return a time in nanoseconds as a message."""
-    message = Time()
+def time_message(stamp: int, message: Time | None = None) -> Time:
+    """Return a time in nanoseconds as a message, a new one or the one that is given."""
+    message = message or Time()
     message.sec, message.nanosec = divmod(stamp, 1_000_000_000)
     return message
 

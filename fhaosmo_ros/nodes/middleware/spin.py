@@ -13,7 +13,7 @@ from typing import TypeVar
 
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.files import with_origin
-from fhaosmo_ros.nodes.middleware.arguments import help_of, read_arguments
+from fhaosmo_ros.nodes.middleware.arguments import help_of, Origins, read_arguments
 from fhaosmo_ros.stop_signals import stop_on_signals, Stopped
 import rclpy
 from rclpy.exceptions import InvalidHandle
@@ -53,10 +53,7 @@ class Spinner:
     """
 
     def __init__(
-        self,
-        node: Node,
-        on_end: Callable[[], None] = lambda: None,
-        grace: float | None = GRACE,
+        self, node: Node, on_end: Callable[[], None] = lambda: None, grace: float | None = GRACE
     ) -> None:
         self.error: BaseException | None = None
         self._on_end, self._grace = on_end, grace
@@ -112,26 +109,12 @@ class Spinner:
 
 def run_node(name: str, factory: Callable[..., Node], argv: list[str] | None) -> int:
     """
-    Run a node until SIGINT, SIGTERM or SIGHUP.
+    Run the node that `factory` makes of given parameters, until SIGINT, SIGTERM or SIGHUP.
 
-    rclpy's own signal handlers are off: SIGINT would come out of the events executor as a
-    RuntimeError, and a second Ctrl-C would cut the clean-up short.
-
-    Parameters
-    ----------
-    name : str
-        estimator or plant.
-    factory : callable
-        Makes the node out of the parameters that are given.
-    argv : list of str or None
-        None for the arguments of the process.
-
-    Returns
-    -------
-    int
-        Exit code: 0 after a signal, 1 if a callback failed, 2 for a bad configuration (said in
-        one line on stderr).
-
+    Returns the exit code: 0 after a signal, 1 if a callback failed, 2 for a bad configuration,
+    which is said in one line on stderr. `argv` is None for the arguments of the process. rclpy's
+    own signal handlers are off: SIGINT would come out of the events executor as a RuntimeError,
+    and a second Ctrl-C would cut the clean-up short.
     """
     argv = sys.argv[1:] if argv is None else argv
     if text := help_of(name, argv):
@@ -139,7 +122,7 @@ def run_node(name: str, factory: Callable[..., Node], argv: list[str] | None) ->
         return 0
     ended = stop_on_signals()
     node = None
-    origins: dict[str, str | None] = {}
+    origins: Origins = {}
     try:
         with ended.raising():
             given, origins, rest = read_arguments(name, argv)
@@ -156,23 +139,22 @@ def run_node(name: str, factory: Callable[..., Node], argv: list[str] | None) ->
             print(f'{name}: error: a callback failed', file=sys.stderr)
             traceback.print_exception(spinner.error)
             return 1
-        return 0
     except Stopped:
-        return 0
-    except (ConfigurationError, RuntimeError) as error:
-        if isinstance(error, ConfigurationError):
-            error = with_origin(error, origins)
-        print(f'{name}: error: {_one_line(error)}', file=sys.stderr)
-        return 2
+        pass
+    except ConfigurationError as error:
+        return _refused(name, str(with_origin(error, origins)))
+    except RuntimeError as error:  # rcl's
+        unknown = 'unknown ROS arguments ' * (type(error).__name__ == 'UnknownROSArgsError')
+        return _refused(name, unknown + re.sub(r', at \S+:\d+', '', str(error)))
     finally:
         if node is not None:
             node.destroy_node()
         rclpy.try_shutdown()
         faulthandler.cancel_dump_traceback_later()
+    return 0
 
 
-def _one_line(error: BaseException) -> str:
-    text = ' '.join(str(error).split())
-    if type(error).__name__ == 'UnknownROSArgsError':
-        return f'unknown ROS arguments {text}'
-    return re.sub(r', at \S+:\d+', '', text)  # rcl's own source lines
+def _refused(name: str, text: str) -> int:
+    """Say in one line what is wrong, and return the exit code."""
+    print(f'{name}: error: {" ".join(text.split())}', file=sys.stderr)
+    return 2
