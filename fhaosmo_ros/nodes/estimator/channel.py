@@ -76,14 +76,13 @@ class Channel:
         self._events = create_publisher(
             node, message_class(DIAGNOSTICS), prefix + EVENT, latched=True
         )
-        wanted = measured_output(values, name)
-        self.y = sources.of(wanted).add(wanted, self._on_sample)
         known = known_inputs(values, observer.used_inputs, name)
         self.pairing = Pairing(values, observer.inputs, known, estimator.inputs)
         self.u: dict[str, Listener] = {}
         for u, its in known.items():
             take = partial(self._on_input, observer.inputs.index(u), u)
-            self.u[u] = sources.of(its).add(its, take, first=True)
+            self.u[u] = sources.add(its, take)
+        self.y = sources.add(measured_output(values, name), self._on_sample)  # behind its inputs
         self.simulated = node.get_parameter('use_sim_time').value
         self._health = Health(self)
 

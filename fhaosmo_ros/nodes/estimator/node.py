@@ -153,7 +153,7 @@ class EstimatorNode(ManagedNode):
         """Choose the sampling of simulated time, once it is known which stamps there are."""
         if not self.get_parameter('use_sim_time').value:
             return
-        stamps = self._sources.stamps
+        stamps = {channel.y.stamps for channel in self._channels if channel.y.stamps}
         if self._chooses_sampling and stamps and stamps <= {'header'}:
             self._chooses_sampling = False
             self.get_logger().info('use_sim_time: dt comes from the header stamps')

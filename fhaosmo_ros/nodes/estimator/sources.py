@@ -41,13 +41,13 @@ class Listener:
     """
     Somebody who takes one number out of each message of a source.
 
-    `is_sample`: of y, not of a known input, which a message gives first. `field` and `stamps`
-    (header, source or reception) are not known before the topic's type; `error` says why its type
-    has no such field. `lacking` messages were without it; `why`: the latest one of them.
+    `field` and `stamps` (header, source or reception) are not known before the topic's type;
+    `error` says why its type has no such field. `lacking` messages were without it; `why`: the
+    latest one of them.
     """
 
-    def __init__(self, wanted: Input, take: Take, source: 'Source', is_sample: bool) -> None:
-        self._wanted, self.take, self.source, self.is_sample = wanted, take, source, is_sample
+    def __init__(self, wanted: Input, take: Take, source: 'Source') -> None:
+        self._wanted, self.take, self.source = wanted, take, source
         self.field: Field | None = None
         self.value: Callable[[Any], float]
         self.stamps = self.error = ''
@@ -99,12 +99,6 @@ class Source:
         self._nameless: set[Gid] = set()
         self._subscription: Any = None
         self._timer: Any = None
-
-    def add(self, wanted: Input, take: Take, first: bool = False) -> Listener:
-        """Add a listener; a `first` one hears a message before those that are not."""
-        listener = Listener(wanted, take, self, is_sample=not first)
-        self.listeners.insert(0 if first else len(self.listeners), listener)
-        return listener
 
     def open(self) -> None:
         """Subscribe, now or once the type of the topic is known."""
@@ -247,6 +241,12 @@ class Sources:
         self._by_topic: dict[str, Source] = {}
         self.after_message: Callable[[], None] = lambda: None
 
+    def add(self, wanted: Input, take: Take) -> Listener:
+        """Return a listener to an input; it hears a message after those that were added before."""
+        source = self.of(wanted)
+        source.listeners.append(Listener(wanted, take, source))
+        return source.listeners[-1]
+
     def of(self, wanted: Input) -> Source:
         """
         Return the source that an input is read from; new ones are not open yet.
@@ -273,12 +273,6 @@ class Sources:
         """Look at the publishers of all topics."""
         for source in self._by_topic.values():
             source.look()
-
-    @property
-    def stamps(self) -> set[str]:
-        """Which stamps the samples of y have, as far as is known."""
-        listeners = [li for source in self._by_topic.values() for li in source.listeners]
-        return {li.stamps for li in listeners if li.stamps and li.is_sample}
 
 
 def find_wanted(types: Mapping[str, Any], wanted: Input) -> Field:

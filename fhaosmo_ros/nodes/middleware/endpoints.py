@@ -82,22 +82,13 @@ def full_name(node: Node, topic: str) -> str:
 
 
 def check_overrides(
-    node: Node,
-    given: Mapping[str, Any],
-    published: Iterable[str],
-    subscribed: Iterable[str] = (),
+    node: Node, given: Mapping[str, Any], published: Iterable[str], subscribed: Iterable[str] = ()
 ) -> None:
     """
     Raise for QoS overrides that rclpy would ignore, or refuse with an unclear message.
 
-    Parameters
-    ----------
-    node : Node
-    given : mapping
-        All that files and the command line set.
-    published, subscribed : iterable of str
-        All topics whose publishers and subscriptions the node makes `OVERRIDABLE`.
-
+    `given` is all that files and the command line set, `published` and `subscribed` are all topics
+    whose publishers and subscriptions the node makes `OVERRIDABLE`.
     """
     endpoints = [
         *(f'{full_name(node, topic)}.publisher' for topic in published),
@@ -110,11 +101,10 @@ def check_overrides(
         endpoint, _, policy = name.removeprefix(OVERRIDES).rpartition('.')
         allowed = policies.get(policy)
         if endpoint not in endpoints or allowed is None:
-            expected = (
-                f'{OVERRIDES}ENDPOINT.POLICY with ENDPOINT one of {", ".join(endpoints)} and '
-                f'POLICY one of {", ".join(policies)}'
+            raise ConfigurationError(
+                f"parameter '{name}': expected {OVERRIDES}ENDPOINT.POLICY with ENDPOINT one of "
+                f'{", ".join(endpoints)} and POLICY one of {", ".join(policies)}'
             )
-            raise ConfigurationError(f"parameter '{name}': expected {expected}")
         if value not in allowed:
             number = f'an integer from {allowed[0]} to {allowed[-1]}'
             expected = number if isinstance(allowed, range) else ' or '.join(allowed)

@@ -75,9 +75,7 @@ def message_class(name: str) -> Any:
 def _is_installed(package: str) -> bool:
     """Return True for a package of messages in site-packages; finding it does not run its code."""
     spec = find_spec(package)
-    if spec is None or spec.origin is None:
-        return False
-    if not Path(spec.origin).with_name('msg').is_dir():
+    if not (spec and spec.origin and Path(spec.origin).with_name('msg').is_dir()):
         return False
     folder = Path(spec.origin).parents[1].resolve()
     own = [Path(path).resolve() for path in (*site.getsitepackages(), site.getusersitepackages())]

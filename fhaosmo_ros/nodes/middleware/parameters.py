@@ -77,19 +77,10 @@ class NodeParameters:
     coerced, prepared and perhaps refused as a set before ROS takes it (pre-set callback), and
     adopted afterwards (post-set callback).
 
-    Parameters
-    ----------
-    node : Node
-    values : Parameters
-        Checked and complete; later the present ones.
-    prepare : callable
-        Gets all values as they would be, and the changes; returns what `adopt` needs, or raises
-        ConfigurationError. Changes nothing.
-    adopt : callable
-        Gets what `prepare` has returned, once ROS has accepted the changes.
-    fixed : iterable of str, optional
-        Parameters that can't change in any state of the node; without it, those that are not live.
-
+    `values` are the present ones. `prepare` gets all values as they would be, and the changes; it
+    returns what `adopt` gets once ROS has accepted them, or raises ConfigurationError, and changes
+    nothing. `fixed` parameters can't change in any state of the node; without it, those that are
+    not live.
     """
 
     def __init__(
