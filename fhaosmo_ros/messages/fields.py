@@ -110,9 +110,10 @@ class Field(NamedTuple):
 
         def read(message: Any) -> float:
             try:
-                return float(getattr(message, elements)[getattr(message, names).index(name)])
-            except (ValueError, IndexError, TypeError):
-                return value(message)  # which says what is wrong; or a byte
+                found = getattr(message, elements)[getattr(message, names).index(name)]
+            except (ValueError, IndexError):
+                return value(message)  # which says what is wrong
+            return found if isinstance(found, float) else value(message)
 
         return read
 
