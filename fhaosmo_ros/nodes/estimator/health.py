@@ -41,9 +41,7 @@ def _words(name: str) -> str:
     return name.replace('_', ' ')
 
 
-UNUSED = (
-    'samples lost', 'damaged messages', *map(_words, UNUSED_SAMPLES), 'rejected inputs'
-)  # fmt: skip
+UNUSED = ('samples lost', *map(_words, UNUSED_SAMPLES), 'rejected inputs')
 """Counters of samples that the observer has not taken."""
 
 
@@ -83,7 +81,6 @@ class Health:
         return {
             'samples accepted': counters.accepted,
             'samples lost': y.source.lost,
-            'damaged messages': y.source.damaged,
             'messages without y': y.lacking,
             'samples rejected': counters.rejected,
             **{_words(name): n for name, n in counters._asdict().items() if name != 'accepted'},

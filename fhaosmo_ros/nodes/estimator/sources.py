@@ -25,7 +25,6 @@ from fhaosmo_ros.nodes.middleware.messages import definitions, message_class
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.qos import qos_check_compatible, QoSCompatibility
-from rclpy.serialization import deserialize_message
 
 DISCOVERY_PERIOD = 0.2
 MOST_TOLD = 3
@@ -76,10 +75,10 @@ class Source:
 
     `message_type` is '' while it is not known. Of the publishers that `look` has seen, by their
     gid, `heard` are the names of nodes that can be heard; of the others `unheard` has a sentence
-    that names the node and says what to do about it. `lost` and `damaged` count messages that did
-    not arrive or are shorter than their type. `delay` is the longest time from a publication to
-    its callback between the latest two looks (ns), `offset` that from the latest header's stamp to
-    its publication. `on_names` is called with the names in each message.
+    that names the node and says what to do about it. `lost` messages did not arrive, or were
+    damaged, which the middleware drops. `delay` is the longest time from a publication to its
+    callback between the latest two looks (ns), `offset` that from the latest header's stamp to its
+    publication. `on_names` is called with the names in each message.
     """
 
     def __init__(self, node: Node, sources: 'Sources', topic: str) -> None:
@@ -88,7 +87,7 @@ class Source:
         self.message_type = ''
         self.heard: dict[Gid, str] = {}
         self.unheard: dict[Gid, str] = {}
-        self.lost = self.damaged = self.offset = 0
+        self.lost = self.offset = 0
         self.delay = self._delay = -math.inf
         self.on_names: Callable[[Any], None] | None = None
         self._sequence, self._mixed = 0, False
@@ -130,7 +129,7 @@ class Source:
 
     def _take_type(self, message_type: str) -> None:
         """Find the fields in a message type, and subscribe if there is one."""
-        self._class, types = message_class(message_type), definitions(message_type)
+        kind, types = message_class(message_type), definitions(message_type)
         for listener in self.listeners:
             listener.find(types, message_type)
         self._served = [listener for listener in self.listeners if listener.field]
@@ -138,7 +137,7 @@ class Source:
         if self._subscription is None and (self._served or self.on_names):
             self.message_type = message_type
             self._subscription = subscribe_with_info(
-                self._node, self._class, self.topic, self._on_message, copy(SENSOR_QOS), raw=True,
+                self._node, kind, self.topic, self._on_message, copy(SENSOR_QOS),
                 qos_overriding_options=OVERRIDABLE,
             )  # fmt: skip
 
@@ -185,7 +184,7 @@ class Source:
         hint = f'change qos_overrides.{self.topic}.subscription, or its own QoS'
         return f'{", ".join(clashes).lower()}; {hint}'
 
-    def _on_message(self, data: bytes, info: Mapping[str, Any]) -> None:
+    def _on_message(self, message: Any, info: Mapping[str, Any]) -> None:
         published = info['source_timestamp']
         self._delay = max(self._delay, time_ns() - published)
         sequence = info['publication_sequence_number'] or 0  # 0: the middleware has none
@@ -194,14 +193,6 @@ class Source:
         elif sequence and self._sequence and not self._mixed:
             self.lost += sequence - self._sequence - 1
         self._sequence = sequence
-        try:
-            message = deserialize_message(data, self._class)
-        except RuntimeError:  # in a subscription that is not raw it would end the node
-            self.damaged += 1
-            self._logger.warning(
-                f'a message on {self.topic} is damaged: left out', throttle_duration_sec=5.0
-            )
-            return
         if self.on_names is not None:
             self.on_names(getattr(message, 'name', None))
         stamps = {'source': published, 'reception': info['received_timestamp']}
