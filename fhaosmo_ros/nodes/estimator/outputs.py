@@ -117,11 +117,10 @@ class TypedOutputs:
         })  # fmt: skip
 
     def add(self, name: str, stamp: int, estimate: Estimate, values: Mapping[str, Any]) -> None:
-        """Let an estimate wait for those of other channels, if anybody listens."""
-        if self._listeners.heard():
-            if name in self._waiting:  # several samples had waited for their known inputs
-                self.publish()
-            self._waiting[name] = Output(name, stamp, estimate, values)
+        """Let an estimate wait for those of other channels."""
+        if name in self._waiting:  # several samples had waited for their known inputs
+            self.publish()
+        self._waiting[name] = Output(name, stamp, estimate, values)
 
     def publish(self) -> None:
         """Publish the estimates that wait, with the latest of their stamps."""

@@ -280,12 +280,7 @@ def find_wanted(types: Mapping[str, Any], wanted: Input) -> Field:
 def check_inputs(node: Node, inputs: Iterable[Input]) -> None:
     """Raise ConfigurationError for names, types or fields that cannot be, as far as given."""
     for wanted in inputs:
-        try:
-            full_name(node, wanted.topic)
-        except ConfigurationError as error:
-            raise ConfigurationError(
-                f"parameters 'input_topic', 'known_input_topics': {error}"
-            ) from None
+        full_name(node, wanted.topic, "parameters 'input_topic', 'known_input_topics': ")
         if wanted.message_type:
             try:
                 find_wanted(definitions(wanted.message_type), wanted)
