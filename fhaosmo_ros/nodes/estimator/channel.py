@@ -193,7 +193,7 @@ class Channel:
         if estimate is not None:
             self._outputs.publish(estimate, stamp)
             name = self.name or (self.y.field and self.y.field.key) or 'y'
-            self._typed.add(name, stamp, estimate, self.values)
+            self._typed.add(name, (stamp, estimate, self.values))
 
     def tick(self) -> None:
         """Publish at the node's rate, if it is to; log once that y is silent."""

@@ -4,7 +4,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from math import nan
 from time import perf_counter
-from typing import Any, NamedTuple
+from typing import Any
 
 from builtin_interfaces.msg import Time
 from fhaosmo_ros.core.model.triangular import TriangularModel
@@ -90,18 +90,8 @@ class Outputs:
             self.due = 0.0 if flags == Flag.RESET else perf_counter() + self._period
 
 
-class Output(NamedTuple):
-    """The latest estimate of a channel, with its parameters and the stamp of its sample (ns)."""
-
-    name: str
-    stamp: int
-    estimate: Estimate
-    values: Mapping[str, Any]
-
-    @property
-    def effort(self) -> float:
-        """The unknown input in the user's unit."""
-        return float(self.estimate.unknown_input * self.values['unknown_input_scale'])
+Output = tuple[int, Estimate, Mapping[str, Any]]
+"""Stamp of a sample (ns), the estimate that belongs to it, parameters of its channel."""
 
 
 class TypedOutputs:
@@ -109,50 +99,55 @@ class TypedOutputs:
 
     def __init__(self, node: Node, values: Mapping[str, Any]) -> None:
         self._frame: str = values['frame_id']
-        self._waiting: dict[str, Output] = {}
+        self._waiting: dict[str, Output] = {}  # by the name of the channel
         self._listeners = Listeners({
             name: node.create_publisher(message_class(TYPED_ESTIMATES[name]), f'~/{name}', DEPTH)
             for name in dict.fromkeys(values['typed_outputs'])
             if name != 'none'
         })  # fmt: skip
 
-    def add(self, name: str, stamp: int, estimate: Estimate, values: Mapping[str, Any]) -> None:
+    def add(self, name: str, output: Output) -> None:
         """Let an estimate wait for those of other channels."""
         if name in self._waiting:  # several samples had waited for their known inputs
             self.publish()
-        self._waiting[name] = Output(name, stamp, estimate, values)
+        self._waiting[name] = output
 
     def publish(self) -> None:
         """Publish the estimates that wait, with the latest of their stamps."""
         if not self._waiting:
             return
-        outputs = list(self._waiting.values())
         for name, publisher in self._listeners.heard().items():
-            message = _joint_states(outputs) if name == 'joint_states' else _on_axes(name, outputs)
+            message = (_joint_states if name == 'joint_states' else _on_axes)(name, self._waiting)
             message.header.frame_id = self._frame
-            message.header.stamp = time_message(max(o.stamp for o in outputs))
+            message.header.stamp = time_message(max(stamp for stamp, *_ in self._waiting.values()))
             publisher.publish(message)
         self._waiting.clear()
 
 
-def _joint_states(outputs: Sequence[Output]) -> JointState:
-    states = [output.estimate.z for output in outputs]
+def _effort(estimate: Estimate, values: Mapping[str, Any]) -> float:
+    """Return the unknown input in the user's unit."""
+    return float(estimate.unknown_input * values['unknown_input_scale'])
+
+
+def _joint_states(_: str, outputs: Mapping[str, Output]) -> JointState:
+    states = [estimate.z for _, estimate, _ in outputs.values()]
     return JointState(
-        name=[output.name for output in outputs],
+        name=list(outputs),
         position=[float(z[0]) for z in states],
         velocity=[float(z[1]) if len(z) > 1 else nan for z in states],
-        effort=[output.effort for output in outputs],
+        effort=[_effort(estimate, values) for _, estimate, values in outputs.values()],
     )
 
 
-def _on_axes(name: str, outputs: Sequence[Output]) -> Any:
+def _on_axes(name: str, outputs: Mapping[str, Output]) -> Any:
     """Return a wrench of the efforts, or an accel of the unknown inputs, on their axes."""
     message = message_class(TYPED_ESTIMATES[name])()
-    for output in outputs:
-        vector, axis = output.values['output_axis'].split('.')
+    for _, estimate, values in outputs.values():
+        vector, axis = values['output_axis'].split('.')
+        d = float(estimate.unknown_input)
         if name == 'wrench':
             vector = {'linear': 'force', 'angular': 'torque'}[vector]
-        d = output.effort if name == 'wrench' else float(output.estimate.unknown_input)
+            d = _effort(estimate, values)
         setattr(getattr(getattr(message, name), vector), axis, d)
     return message
 
