@@ -186,11 +186,10 @@ class ArmNode(TimedNode):
                 heard[topic].publish(message)
         if publisher := heard.get('external_wrench'):
             frame = self._values['wrench_frame']
-            wrench, message = arm.wrench(estimate, frame), WrenchStamped()
-            self._near = wrench.near_singular
+            (wrench, self._near), message = arm.wrench(estimate, frame), WrenchStamped()
             message.header.stamp, message.header.frame_id = stamp, frame
             message.wrench.force, message.wrench.torque = (
-                Vector3(x=x, y=y, z=z) for x, y, z in (wrench.force, wrench.torque)
+                Vector3(x=x, y=y, z=z) for x, y, z in (wrench[:3], wrench[3:])
             )
             publisher.publish(message)
 

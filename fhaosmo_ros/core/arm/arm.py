@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 from fhaosmo_ros.core.arm.bank import Bank
 from fhaosmo_ros.core.arm.calibration import Calibration
 from fhaosmo_ros.core.arm.doubts import Doubts
-from fhaosmo_ros.core.arm.model import ArmModel, Payload, Terms
+from fhaosmo_ros.core.arm.model import ArmModel, Terms
 from fhaosmo_ros.core.arm.samples import Clock, Noise, Samples
 from fhaosmo_ros.core.parameters.arm import ARM_PARAMETERS
 from fhaosmo_ros.core.parameters.declaration import Parameters
@@ -59,11 +59,13 @@ SLIDING = 0.005
 """s: memory of the differences of positions that friction is computed from."""
 FAULTS = ('too strong', 'beyond limits', 'too fast')
 """What an effort, a position and a velocity can be that no arm has."""
+ANEW = ('clock set back', 'restarts', 'jumped', 'diverged')
+"""What makes the estimates begin anew."""
 
 
 class ArmEstimate(NamedTuple):
     """
-    What is estimated at one sample.
+    What is estimated at one sample; of a run, with a row for each, NaN where it was not used.
 
     Attributes
     ----------
@@ -82,38 +84,19 @@ class ArmEstimate(NamedTuple):
 
     """
 
-    stamp: int
+    stamp: Any
     position: Floats
     velocity: Floats
     external_torque: Floats
     covariance: Floats
-    log_odds: float
-    contact: bool
-    link: str
+    log_odds: Any
+    contact: Any
+    link: Any
 
     @property
     def standard_deviation(self) -> Floats:
         """Of external_torque, (n,)."""
-        return np.asarray(np.sqrt(np.diag(self.covariance)))
-
-
-class ArmEstimates(NamedTuple):
-    """Estimates of a run: arrays with a row for each sample; NaN where a sample was not used."""
-
-    velocity: Floats
-    external_torque: Floats
-    standard_deviation: Floats
-    log_odds: Floats
-    contact: NDArray[np.bool_]
-    link: list[str]
-
-
-class Wrench(NamedTuple):
-    """Force (3,) in N and torque (3,) in N m along the axes of a frame."""
-
-    force: Floats
-    torque: Floats
-    near_singular: bool  # part of it cannot be seen in this posture
+        return np.asarray(np.sqrt(np.diagonal(self.covariance, axis1=-2, axis2=-1)))
 
 
 class Arm:
@@ -162,15 +145,15 @@ class Arm:
         **named: Any,
     ) -> None:
         p = self.parameters = ARM_PARAMETERS.complete(parameters, named)
-        if calibration is None and p['calibration_file']:
-            calibration = Calibration.loads(
-                text_of(p, 'calibration_file', 'a file of `calibrate`')
-            )
         if len(p['gravity']) != 3:
             raise ARM_PARAMETERS['gravity'].error(p['gravity'], 'three numbers')
         chosen = [name for name in p['joints'] if name]
         self.model = model = ArmModel(urdf, joints=chosen, gravity=p['gravity'])
-        self.joints = model.joints
+        self.joints, n = model.joints, len(model.joints)
+        if calibration is None and p['calibration_file']:
+            calibration = Calibration.loads(
+                text_of(p, 'calibration_file', 'a file of `calibrate`')
+            )
         self._calibrated = calibration is not None
         known = self.calibration = calibration or Calibration.of_urdf(model)
         if known.joints != model.joints:
@@ -181,7 +164,6 @@ class Arm:
         model.set_inertial(known.inertial, known.motor_inertia)
         self.adopt(p)
         self._of_position = p['measurement'] == 'position'
-        self._rest = np.zeros(len(model.joints))
         self._with_gravity = p['effort'] != 'gravity_compensated'
         self._delay = int(p['torque_delay'] * 1e9)
         given = self._values('torque_constants')
@@ -209,9 +191,7 @@ class Arm:
             2.0 * DECAY * self._model_variance, DECAY, np.array(INTENSITIES) * model.weight,
             RATES, ONSET, SINCE if self._of_position else 0.0, self._of_position,
         )  # fmt: skip
-        self._entrance = Clock()  # of samples that wait until their effort has come
-        self.doubts = Doubts(model, self._with_gravity, np.sqrt(self._model_variance))
-        self._tare = np.zeros(len(self.joints))
+        self._rest, self._tare = np.zeros((2, n))
         self.counters: Counter[str] = Counter()
         self.problem = ''
         self._newest: int | None = None  # stamp
@@ -222,7 +202,7 @@ class Arm:
         given, n = self.parameters[name], len(self.joints)
         if len(given) not in (1, n):
             raise ARM_PARAMETERS[name].error(given, f'1 or {n} numbers')
-        return np.broadcast_to(np.array(given), n).copy()
+        return np.broadcast_to(np.array(given), n)
 
     def _size(self, name: str, otherwise: Floats | float = 0.0) -> Floats:
         """Return the size of a noise: by calibration, else by the parameter, else `otherwise`."""
@@ -231,15 +211,13 @@ class Arm:
 
     def reset(self) -> None:
         """Begin anew with the next sample."""
-        n = len(self.joints)
-        self._first: Any = None  # Terms and drive of the first sample
         self._waiting: deque[tuple[int, int, Floats]] = deque()  # stamps, times and samples
+        self._entrance = Clock()  # of samples that wait until their effort has come
         self._velocity: Floats | None = None  # estimated
         self._contact = False
-        self._looked, self._evidence = 0, np.zeros(n)  # stamp, and log-likelihood of each link
-        self.doubts.reset()
+        self._looked, self._evidence = 0, self._rest  # stamp, and log-likelihood of each link
+        self.doubts = Doubts(self.model, self._with_gravity, np.sqrt(self._model_variance))
         self._samples.reset()
-        self._entrance.reset()
 
     def adopt(self, parameters: Parameters) -> None:
         """Go on with other live parameters; raise ConfigurationError for a bad payload."""
@@ -290,15 +268,16 @@ class Arm:
         if self._newest is not None and stamp <= self._newest:
             if stamp > self._newest - MAX_GAP * 1e9:
                 return self._refuse('not newer')
-            self.reset()
             self._refuse('clock set back')
         self._newest = stamp
-        return (
-            self._go_on_late(stamp, sample) if self._delay else self._go_on(stamp, stamp, sample)
-        )
+        if self._delay:
+            return self._go_on_late(stamp, sample)
+        return self._go_on(stamp, stamp, sample)
 
     def _refuse(self, problem: str) -> ArmEstimate | None:
-        """Count a sample that is not used."""
+        """Count a sample that is not used, and begin anew where that has to be."""
+        if problem in ANEW:
+            self.reset()
         self.problem = problem
         self.counters[problem] += 1
         return None
@@ -306,7 +285,6 @@ class Arm:
     def _go_on_late(self, stamp: int, sample: Floats) -> ArmEstimate | None:
         """Go on to an earlier time: the effort is as old as that, and the rest was kept."""
         if self._waiting and stamp - self._waiting[-1][0] > MAX_GAP * 1e9:
-            self.reset()
             self._refuse('restarts')
         kept, time = self._waiting, stamp
         if kept:
@@ -333,12 +311,9 @@ class Arm:
         torque, q, velocity = sample
         bank, samples = self._bank, self._samples
         problem = samples.take(time, sample, self._velocity, bank.motion)
-        if problem in ('standing still', 'repeated'):
-            return self._refuse(problem)
-        if problem in ('restarts', 'jumped'):
-            self.reset()
+        if problem not in ('', 'first'):
             self._refuse(problem)
-            if problem == 'jumped':
+            if problem != 'restarts':
                 return None
             samples.take(time, sample, None, bank.motion)  # as the first one
         if problem:
@@ -351,14 +326,10 @@ class Arm:
             wide = 2.0 * self._variance / (h * h if self._of_position else 1.0)
             spread = (terms.mass * wide) @ terms.mass.T
             bank.start(terms.mass, drive, terms.mass @ speed, spread, self._model_variance)
+        if self._velocity is None or not self._of_position:
             self._velocity = self._sliding = speed.copy()
-        if self._of_position:
-            if self._calibrated:
-                share = -np.expm1(-h / SLIDING)
-                self._sliding = self._sliding + share * (speed - self._sliding)
-            terms, drive = self._drive(q, self._velocity, torque, self._sliding)
-        else:
-            terms, drive = self._drive(q, velocity, torque, velocity)
+        self._sliding = self._sliding - np.expm1(-h / SLIDING) * (speed - self._sliding)
+        terms, drive = self._drive(q, self._velocity, torque, self._sliding)
         bank.step(
             h, terms.mass, samples.change, self._variance, samples.vague, drive,
             self._torque_variance, self._reach,
@@ -368,7 +339,6 @@ class Arm:
             return self._refuse('doubted')
         self._velocity = speed = self.model.velocity_of(bank.mean[1])
         if not samples.is_possible(speed):  # C^T qd grows with its square
-            self.reset()
             return self._refuse('diverged')
         self.counters['used'] += 1
         return self._estimate(stamp, q, speed)
@@ -400,8 +370,7 @@ class Arm:
         would feed its own error of friction back, worst at joints of little inertia.
         """
         terms = self.model.terms(q, velocity)
-        drive = terms.coriolis + torque
-        drive += self._tare
+        drive = terms.coriolis + torque + self._tare
         if self._calibrated:
             drive -= self.calibration.friction(sliding)
         if self._with_gravity:
@@ -417,42 +386,34 @@ class Arm:
 
     def run(
         self, t: ArrayLike, q: ArrayLike, effort: ArrayLike, velocity: ArrayLike | None = None
-    ) -> ArmEstimates:
+    ) -> ArmEstimate:
         """
         Estimate from arrays: t (K,) in s, q, effort and velocity (K, n).
 
-        Raises
-        ------
-        ConfigurationError
-            Arrays of other sizes.
-
+        Raise ConfigurationError for arrays of other sizes.
         """
         stamps = np.round(np.asarray(t, dtype=np.float64) * 1e9).astype(np.int64)
-        k, n = len(stamps), len(self.joints)
-        given = {'q': q, 'effort': effort, 'velocity': velocity}
-        arrays = {
-            name: np.asarray(a, dtype=np.float64) for name, a in given.items() if a is not None
-        }
-        for name, array in arrays.items():
-            if array.shape != (k, n):
-                raise ConfigurationError(
-                    f'run: {name}: expected shape {(k, n)}, got {array.shape}'
-                )
-        none = np.full((n, n), np.nan)
+        shape = len(stamps), len(self.joints)
+        arrays = [np.asarray(a, dtype=np.float64) for a in (q, effort, velocity) if a is not None]
+        for name, array in zip(('q', 'effort', 'velocity'), arrays, strict=False):
+            if array.shape != shape:
+                raise ConfigurationError(f'run: {name}: expected shape {shape}, got {array.shape}')
+        none = np.full((shape[1], shape[1]), np.nan)
         unused = ArmEstimate(0, none[0], none[0], none[0], none, np.nan, False, '')
         found = [
-            self.take(int(stamp), *row) or unused
-            for stamp, *row in zip(stamps, *arrays.values(), strict=True)
+            self.take(int(stamp), *row) or unused._replace(stamp=stamp)
+            for stamp, *row in zip(stamps, *arrays, strict=True)
         ]
-        *columns, links = ([getattr(e, name) for e in found] for name in ArmEstimates._fields)
-        return ArmEstimates._make([*map(np.array, columns), links])
+        *columns, links = ([getattr(e, name) for e in found] for name in ArmEstimate._fields)
+        return ArmEstimate._make([*map(np.array, columns), links])
 
-    def wrench(self, estimate: ArmEstimate, frame: str) -> Wrench:
+    def wrench(self, estimate: ArmEstimate, frame: str) -> tuple[Floats, bool]:
         """
         Return the wrench at the origin of a frame that would make the estimated torque.
 
-        Damped least squares, weighted by the covariance of the torque. Raises ConfigurationError
-        for an unknown frame.
+        Force (3,) in N and torque (3,) in N m along the frame's axes, as one array, and True if
+        part of it cannot be seen in this posture. Damped least squares, weighted by the covariance
+        of the torque. Raise ConfigurationError for an unknown frame.
         """
         jacobian = self.model.frame_jacobian(estimate.position, frame)
         root = np.linalg.cholesky(estimate.covariance)
@@ -461,15 +422,15 @@ class Arm:
         prior = DAMPING**2 / np.mean(np.diag(estimate.covariance)) * np.eye(6)
         covariance = np.linalg.inv(weighted.T @ weighted + prior)
         found = covariance @ weighted.T @ np.linalg.solve(root, estimate.external_torque)
-        return Wrench(found[:3], found[3:], bool(len(values) < 6 or values[-1] < DAMPING))
+        return found, bool(len(values) < 6 or values[-1] < DAMPING)
 
 
-def payload_of(p: Parameters) -> Payload:
+def payload_of(p: Parameters) -> list[float]:
     """Return the payload that parameters say; raise for one that cannot be."""
-    if len(p['payload']) != 4 or p['payload'][0] < 0.0:
-        raise ARM_PARAMETERS['payload'].error(p['payload'], 'mass >= 0 and three coordinates')
-    mass, *center = p['payload']
-    return Payload(mass, tuple(center))
+    payload: list[float] = p['payload']
+    if len(payload) != 4 or payload[0] < 0.0:
+        raise ARM_PARAMETERS['payload'].error(payload, 'mass >= 0 and three coordinates')
+    return payload
 
 
 def text_of(parameters: Parameters, name: str, expected: str) -> str:

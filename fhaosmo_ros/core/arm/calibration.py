@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """What `calibrate` finds about one arm, and its file."""
 
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 
 from fhaosmo_ros.core.arm.model import ArmModel
+from fhaosmo_ros.core.parameters.declaration import shown
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 import numpy as np
 from numpy.typing import NDArray
@@ -51,16 +52,16 @@ class Calibration:
     position_noise: Floats
     torque_noise: Floats
     model_error: Floats
-    log_odds: float = 0.0
+    log_odds: float | Floats = 0.0
 
     @classmethod
     def of_urdf(cls, model: ArmModel) -> 'Calibration':
         """Return that of an arm of which only the URDF is known."""
         n = len(model.joints)
-        zeros = np.zeros(n)
+        none = np.zeros(n)
         return cls(
-            model.joints, model.unloaded, zeros, zeros, zeros, np.zeros((n, len(WIDTHS))),
-            np.ones(n), zeros, zeros, zeros,
+            model.joints, model.unloaded, none, none, none, np.zeros((n, len(WIDTHS))), np.ones(n),
+            none, none, none,
         )  # fmt: skip
 
     def friction(self, velocity: Floats) -> Floats:
@@ -72,42 +73,28 @@ class Calibration:
 
     def dumps(self) -> str:
         """Return the text of the file."""
-        values = {
-            name: value.tolist() if isinstance(value, np.ndarray) else value
-            for name, value in asdict(self).items()
-        }
-        values['joints'] = list(self.joints)
+        values = {name: np.asarray(value).tolist() for name, value in asdict(self).items()}
         return yaml.safe_dump({'arm_calibration': values}, sort_keys=False, width=100)
 
     @classmethod
     def loads(cls, text: str) -> 'Calibration':
-        """
-        Return what a file says.
-
-        Raises
-        ------
-        ConfigurationError
-            Not such a file, a missing or unknown name, another size, a number that is not finite.
-
-        """
+        """Return what a file says; raise ConfigurationError for one that is none, or not whole."""
         try:
             given = dict(yaml.safe_load(text)['arm_calibration'])
-            joints = tuple(map(str, given.pop('joints', ())))
+            joints = tuple(map(str, given.pop('joints')))
             arrays = {name: np.array(v, dtype=np.float64) for name, v in given.items()}
+            found = cls(joints, **arrays)
         except (yaml.YAMLError, TypeError, KeyError, ValueError) as error:
             raise ConfigurationError(
                 f'calibration: expected a file of `calibrate`, got {text[:40]!r} ({error})'
             ) from None
-        n, known = len(joints), {f.name for f in fields(cls)} - {'joints'}
-        if set(arrays) != known:
-            wrong = ', '.join(sorted(set(arrays) ^ known))
-            raise ConfigurationError(f'calibration: missing or unknown are {wrong}')
+        n = len(joints)
         shapes = {'inertial': (n, 10), 'coulomb': (n, len(WIDTHS)), 'log_odds': ()}
         for name, array in arrays.items():
             shape = shapes.get(name, (n,))
             if array.shape != shape or not np.isfinite(array).all():
                 raise ConfigurationError(
                     f'calibration: {name}: expected finite numbers of shape {shape}, got '
-                    f'{array.shape if array.shape != shape else "others"}'
+                    f'{shown(array)}'
                 )
-        return cls(joints, log_odds=float(arrays.pop('log_odds')), **arrays)
+        return found

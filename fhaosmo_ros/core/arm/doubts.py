@@ -35,13 +35,9 @@ class Doubts:
 
     def __init__(self, model: ArmModel, with_gravity: bool, error: Floats) -> None:
         self._model, self._with_gravity, self._error = model, with_gravity, error
-        self.reset()
-
-    def reset(self) -> None:
-        """Forget everything."""
         self._time = 0.0
-        self.text, self.payload = '', False
         self._sums: list[Any] = [0.0] * 8
+        self.text, self.payload = '', False
 
     def take(self, h: float, q: Floats, effort: Floats, torque: Floats) -> None:
         """Look at a sample, `h` seconds after the one before; `torque` is the external one."""
@@ -53,25 +49,18 @@ class Doubts:
         payload = self._model.regressor(q, rest, rest)[:, last : last + 4]
         columns = np.column_stack([self._model.gravity_columns(q), -payload])
         a, scaled = columns / self._error[:, np.newaxis], torque / self._error
-        news = (
-            1.0, q, q**2, effort * torque, effort**2, scaled**2, a.T @ a, a.T @ scaled
-        )  # fmt: skip
+        news = 1.0, q, q**2, effort * torque, effort**2, scaled**2, a.T @ a, a.T @ scaled
         self._sums = [keep * old + new for old, new in zip(self._sums, news, strict=True)]
         if EVERY * self._sums[0] > LEAST:
-            self._judge()
+            self.payload = False
+            self.text = self._explanation()
 
-    def _judge(self) -> None:
-        """Choose what explains the torque, if something does."""
-        self.text, self.payload = '', False
+    def _explanation(self) -> str:
+        """Return what explains the torque, if something does."""
         count, mean, square, both, own, squares, normal, seen = self._sums
         moved = np.max(square / count - (mean / count) ** 2) > MOVED**2
         if not moved or np.mean(squares) < LARGE**2 * count:
-            return
-        slopes = both / np.maximum(own, 1e-12)
-        wrong = (
-            (np.abs(slopes + 2.0) < 0.5) & (squares > LARGE**2 * count)
-            & (both * slopes / self._error**2 > EXPLAINED * squares)
-        )  # fmt: skip
+            return ''
 
         def fit(part: slice, least: float) -> Floats | None:
             """Return the factors of a mistake that explains the torque, None if it does not."""
@@ -81,33 +70,37 @@ class Doubts:
             factors = np.asarray(np.linalg.solve(normal[part, part], seen[part]))
             return factors if seen[part] @ factors > EXPLAINED * np.sum(squares) else None
 
-        gravity, payload = fit(slice(0, 3), SEEN[0]), fit(slice(3, 7), SEEN[1])
-        if gravity is not None:
-            self.text = self._of_gravity(gravity)
-        if not self.text and wrong.any():
+        change = fit(slice(0, 3), SEEN[0])
+        if change is not None:
+            known = self._model.gravity
+            gravity = self._with_gravity * known - change
+            size = np.linalg.norm(gravity) / np.linalg.norm(known)
+            cosine = gravity @ known / (size * (known @ known))
+            if size < 0.3:
+                return (
+                    'effort has no gravity in it: set the parameter effort to gravity_compensated'
+                )
+            if not self._with_gravity:
+                return 'effort has gravity in it: set the parameter effort to torque'
+            if cosine < -0.9:
+                return 'the efforts of all joints have the wrong sign'
+            if cosine < 0.98 and 0.7 < size < 1.4:
+                text = ', '.join(f'{x:.2f}' for x in gravity)
+                return f"gravity is as if it were [{text}] in the base's frame: parameter gravity"
+        slopes = both / np.maximum(own, 1e-12)
+        wrong = (
+            (np.abs(slopes + 2.0) < 0.5) & (squares > LARGE**2 * count)
+            & (both * slopes / self._error**2 > EXPLAINED * squares)
+        )  # fmt: skip
+        if wrong.any():
             names = ', '.join(np.array(self._model.joints)[wrong])
-            self.text = f'the effort of {names} has the wrong sign'
-        if not self.text and payload is not None and payload[0] > 0.0:
-            numbers = ', '.join(f'{x:.3g}' for x in (payload[0], *(payload[1:] / payload[0])))
-            self.text = (
-                f'the external torque is that of {payload[0]:.3g} kg more at the last link: if it '
-                f'carries something, set the parameter payload to [{numbers}]'
-            )
-            self.payload = True
-
-    def _of_gravity(self, factors: Floats) -> str:
-        """Return what a change of gravity's vector means."""
-        known = self._model.gravity
-        seen = (known if self._with_gravity else np.zeros(3)) - factors
-        size, expected = np.linalg.norm(seen), np.linalg.norm(known)
-        if size < 0.3 * expected:
-            return 'effort has no gravity in it: set the parameter effort to gravity_compensated'
-        if not self._with_gravity:
-            return 'effort has gravity in it: set the parameter effort to torque'
-        cosine = seen @ known / (size * expected)
-        if cosine < -0.9:
-            return 'the efforts of all joints have the wrong sign'
-        if cosine < 0.98 and 0.7 < size / expected < 1.4:
-            text = ', '.join(f'{x:.2f}' for x in seen)
-            return f'gravity is as if it were [{text}] in the frame of the base: parameter gravity'
-        return ''
+            return f'the effort of {names} has the wrong sign'
+        payload = fit(slice(3, 7), SEEN[1])
+        self.payload = payload is not None and payload[0] > 0.0
+        if payload is None or not self.payload:
+            return ''
+        numbers = ', '.join(f'{x:.3g}' for x in (payload[0], *(payload[1:] / payload[0])))
+        return (
+            f'the external torque is that of {payload[0]:.3g} kg more at the last link: if it '
+            f'carries something, set the parameter payload to [{numbers}]'
+        )

@@ -11,10 +11,11 @@ URDF, so that what the motion does not show stays as it is.
 from typing import NamedTuple
 
 from fhaosmo_ros.core.arm.calibration import Calibration, WIDTHS
-from fhaosmo_ros.core.arm.model import ArmModel, Payload
+from fhaosmo_ros.core.arm.model import ArmModel
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import least_squares
 from scipy.signal import butter, sosfiltfilt
 
 Floats = NDArray[np.float64]
@@ -35,6 +36,8 @@ LEAST_ROWS, SHORTEST = 200, 10.0
 """Samples, and seconds, of the shortest recording."""
 LEVER = 0.1
 """m: how far a link's centre may lie from where the URDF has it."""
+FARTHEST = 2.0
+"""m: how far the centre of a payload may lie from the last joint, each way."""
 SWEEPS, LEAST_SHARE = 500, 1e-3
 """Of the search for links that can exist; their least pseudo-inertia, as a share."""
 STILL = 0.05
@@ -105,11 +108,25 @@ def identify(
             f'{len(t)} samples'
         )
     problem = _Regression(model, t, q, effort, Calibration.of_urdf(model), torque_constants)
+    before = problem.unexplained
     held = ((problem.t - problem.t[0]) // BLOCK).astype(int) % HELD_OUT == HELD_OUT - 1
-    found = [problem.solve(~held, draw) for draw in DRAWS]
-    errors = [np.sum((problem.left(x)[held] / problem.size) ** 2) for x in found]
+    errors = [
+        np.sum(((before - problem.columns @ problem.solve(~held, draw))[held] / problem.size) ** 2)
+        for draw in DRAWS
+    ]
     x = problem.solve(~held, DRAWS[int(np.argmin(errors))], possible=True)
-    left = problem.left(x)
+    left = before - problem.columns @ x
+    for name, v in zip(model.joints, problem.velocity.T, strict=True):
+        ahead = v[np.abs(v) > STILL] > 0.0
+        if not len(ahead):
+            problem.notes.append(
+                f'{name} hardly moved (at most {np.abs(v).max():.2g} rad/s): what is found of it '
+                'is mostly the URDF'
+            )
+        elif not ONE_WAY <= np.mean(ahead) <= 1.0 - ONE_WAY:
+            problem.notes.append(
+                f'{name} moved one way only: its friction cannot be told from its offset'
+            )
     motor_inertia, offset, viscous, *coulomb = x[10 * n :].reshape(-1, n)
     calibration = Calibration(
         model.joints, model.unloaded + x[: 10 * n].reshape(n, 10), motor_inertia, offset, viscous,
@@ -117,15 +134,14 @@ def identify(
         noise_of(effort) * np.abs(problem.constants), np.maximum(_rms(left[held]), 1e-9),
     )  # fmt: skip
     return Identified(
-        calibration, _rms(problem.unexplained[held]), _rms(left[held]),
-        problem.notes + _notes(model.joints, problem.velocity), problem.t, problem.torque,
-        problem.torque - problem.unexplained, problem.torque - left, held,
+        calibration, _rms(before[held]), _rms(left[held]), problem.notes, problem.t,
+        problem.torque, problem.torque - before, problem.torque - left, held,
     )  # fmt: skip
 
 
 def payload_of_motion(
     model: ArmModel, t: Floats, q: Floats, effort: Floats, calibration: Calibration
-) -> tuple[Payload, Floats, Floats]:
+) -> tuple[Floats, Floats, Floats]:
     """
     Return what the last link carries, and the RMS of the torque left without and with it, (n,).
 
@@ -133,18 +149,16 @@ def payload_of_motion(
     """
     problem = _Regression(model, t, q, effort, calibration, calibration.torque_constants)
     last = 10 * (len(model.joints) - 1)
-    moving = problem.columns[..., last : last + 4]
-    turning = problem.columns[..., last + 4 : last + 10]
-    weighted = moving / problem.size[:, np.newaxis]
-    payload, explained = Payload(), np.zeros(problem.unexplained.shape)
-    for _ in range(ROUNDS):
-        turned = turning @ model.inertial_of(payload)[4:]  # needs the mass and its place
-        left = (problem.unexplained - turned) / problem.size
-        x, *_ = np.linalg.lstsq(weighted.reshape(-1, 4), left.ravel(), rcond=None)
-        explained = moving @ x + turned
-        mass, *moment = x.tolist()
-        payload = Payload(mass, tuple(m / mass for m in moment)) if mass > 0.0 else Payload()
-    return payload, _rms(problem.unexplained), _rms(problem.unexplained - explained)
+    columns = problem.columns[..., last : last + 10]
+
+    def missed(payload: Floats) -> Floats:
+        return np.asarray(problem.unexplained - columns @ model.inertial_of(payload))
+
+    payload = least_squares(
+        lambda payload: (missed(payload) / problem.size).ravel(), [0.1, 0.0, 0.0, 0.0],
+        bounds=([0.0, -FARTHEST, -FARTHEST, -FARTHEST], [np.inf, FARTHEST, FARTHEST, FARTHEST]),
+    ).x  # fmt: skip
+    return payload, _rms(problem.unexplained), _rms(missed(payload))
 
 
 class _Regression:
@@ -298,27 +312,6 @@ class _Regression:
             normal[others, others], right[others] - normal[others, bodies] @ x[bodies]
         )
         return np.asarray(x)
-
-    def left(self, x: Floats) -> Floats:
-        """Return the torque that is left unexplained, (K, n)."""
-        return np.asarray(self.unexplained - self.columns @ x)
-
-
-def _notes(joints: tuple[str, ...], velocity: Floats) -> list[str]:
-    """Return what the motion of the joints (K, n) does not show."""
-    notes = []
-    for name, v in zip(joints, velocity.T, strict=True):
-        moving = np.abs(v) > STILL
-        if not moving.any():
-            notes.append(
-                f'{name} hardly moved (at most {np.abs(v).max():.2g} rad/s): what is found of it '
-                'is mostly the URDF'
-            )
-            continue
-        ahead = float(np.mean(v[moving] > 0.0))
-        if min(ahead, 1.0 - ahead) < ONE_WAY:
-            notes.append(f'{name} moved one way only: its friction cannot be told from its offset')
-    return notes
 
 
 def _rms(values: Floats) -> Floats:

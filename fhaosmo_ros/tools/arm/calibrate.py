@@ -93,7 +93,7 @@ def _calibrate(arguments: argparse.Namespace, stop: Stop) -> None:
 def _payload(arm: Arm, t: Any, q: Any, torque: Any) -> None:
     """Print the payload as a parameter."""
     payload, before, after = payload_of_motion(arm.model, t, q, torque, arm.calibration)
-    numbers = ', '.join(f'{x:.4g}' for x in (payload.mass, *payload.center))
+    numbers = ', '.join(f'{x:.4g}' for x in payload)
     for name, b, a in zip(arm.joints, before, after, strict=True):
         print(f'{name}: unexplained {b:.3g} N m without, {a:.3g} N m with the payload')
     print(f'\npayload: [{numbers}]    # kg and m, in the frame of {arm.joints[-1]}')
