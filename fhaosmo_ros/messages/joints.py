@@ -1,20 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a sensor_msgs/msg/JointState, live or of a bag, says of the joints of an arm."""
 
-from functools import lru_cache
 from typing import Any
 
+from fhaosmo_ros.core.arm.arm import Arm
 from fhaosmo_ros.core.parameters.declaration import suggestion
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 import numpy as np
 from numpy.typing import NDArray
 
 
-def joint_sample(
-    message: Any, joints: tuple[str, ...], with_velocity: bool
-) -> tuple[int, list[NDArray[np.float64]]]:
+def joint_sample(message: Any, arm: Arm) -> tuple[int, list[NDArray[np.float64]]]:
     """
-    Return the stamp in ns, and position, effort and perhaps velocity in the order of `joints`.
+    Return what `Arm.take` needs: the stamp in ns, and position, effort and perhaps velocity.
 
     Raises
     ------
@@ -22,9 +20,14 @@ def joint_sample(
         A joint, a number or the stamp is missing.
 
     """
-    names = tuple(message.name)
-    order, arrays = _order(names, joints), []
-    for what in ('position', 'effort', *['velocity'] * with_velocity):
+    names, arrays = list(message.name), []
+    if missing := [name for name in arm.joints if name not in names]:
+        raise ConfigurationError(
+            f'a message lacks {", ".join(missing)}{suggestion(missing[0], names)}'
+        )
+    order = [names.index(name) for name in arm.joints]
+    measured = ['velocity'] * (arm.parameters['measurement'] == 'velocity')
+    for what in ('position', 'effort', *measured):
         numbers = getattr(message, what)
         if len(numbers) != len(names):
             raise ConfigurationError(
@@ -35,14 +38,3 @@ def joint_sample(
     if stamp == 0:
         raise ConfigurationError('the header stamp is 0: nobody fills it')
     return stamp, arrays
-
-
-@lru_cache(maxsize=16)  # messages of a driver have the same names
-def _order(names: tuple[str, ...], joints: tuple[str, ...]) -> NDArray[np.intp]:
-    """Return where each joint is among the names."""
-    missing = [name for name in joints if name not in names]
-    if missing:
-        raise ConfigurationError(
-            f'a message lacks {", ".join(missing)}{suggestion(missing[0], names)}'
-        )
-    return np.array([names.index(name) for name in joints])

@@ -7,7 +7,7 @@ from time import perf_counter
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
-from fhaosmo_ros.core.arm.arm import Arm, ArmEstimate, payload_of, text_of
+from fhaosmo_ros.core.arm.arm import ANEW, Arm, ArmEstimate, payload_of, text_of
 from fhaosmo_ros.core.parameters.declaration import Parameters, Value
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.files import complete
@@ -43,16 +43,15 @@ SILENT = 0.5
 """Seconds without a sample that are reported."""
 QUIET = 5.0
 """Seconds between two lines of the log about one problem."""
-TOPICS = {
-    'external_torque': JointState, 'standard_deviation': JointState, 'joint_states': JointState,
-    'external_wrench': WrenchStamped, 'event': DiagnosticArray,
-}  # fmt: skip
 FIELDS = {
     'external_torque': {'effort': 'external_torque'},
     'standard_deviation': {'effort': 'standard_deviation'},
     'joint_states': {'position': 'position', 'velocity': 'velocity'},
 }
 """What the fields of a JointState are in `ArmEstimate`."""
+TOPICS = dict.fromkeys(FIELDS, JointState) | {
+    'external_wrench': WrenchStamped, 'event': DiagnosticArray
+}  # fmt: skip
 SERVICES = {
     'reset': 'the estimates begin anew with the next sample',
     'tare': 'the present external torque counts as zero',
@@ -60,18 +59,17 @@ SERVICES = {
 MEANT = {
     'beyond limits': 'positions lie beyond the limits of the URDF: are they in degrees, or is it '
     'another robot?',
-    'jumped': 'positions jumped faster than three times the velocity limit of the URDF: the '
-    'estimates began anew',
+    'jumped': 'positions jumped faster than three times the velocity limit of the URDF',
     'not finite': 'positions, efforts or velocities are NaN or infinite',
     'not newer': 'the stamp is not later than that of the sample before',
     'too strong': 'efforts are a hundred times those of the URDF: what is the unit of effort?',
     'too fast': 'velocities are more than three times the limit of the URDF: are they in degrees?',
     'standing still': 'positions stay the same to the last digit though the arm was moving: is '
     'the driver stuck?',
-    'diverged': 'the estimated velocity became more than three times the limit of the URDF: are '
-    'stamps and efforts right? The estimates began anew',
-    'clock set back': 'stamps are more than 0.1 s older than before: the estimates began anew',
-    'restarts': 'a gap of more than 0.1 s: the estimates began anew',
+    'diverged': 'the estimated velocity became more than three times the limit of the URDF (are '
+    'stamps and efforts right?)',
+    'clock set back': 'stamps are more than 0.1 s older than before',
+    'restarts': 'a gap of more than 0.1 s',
 }
 """What the counters of `Arm` mean."""
 
@@ -98,7 +96,6 @@ class ArmNode(TimedNode):
         self._logged: dict[str, float] = {}  # when each kind of problem was, by perf_counter
         self._published, self._latest = -np.inf, -np.inf
         self._contact: bool | None = False  # None: not known
-        self._near = False
         self._estimate: ArmEstimate | None = None
         self._outputs = {
             topic: create_publisher(self, kind, f'~/{topic}', latched=topic == 'event')
@@ -114,17 +111,17 @@ class ArmNode(TimedNode):
             self.create_subscription(String, 'robot_description', self._on_description, LATCHED)
             self.get_logger().info(f'waiting for the robot on {self._topic}')
         self.create_subscription(JointState, values['input_topic'], self._on_sample, SENSOR_QOS)
-        for name, text in SERVICES.items():
-            self.create_service(Trigger, f'~/{name}', partial(self._serve, name, text))
+        for name in SERVICES:
+            self.create_service(Trigger, f'~/{name}', partial(self._serve, name))
         self._diagnostics = DiagnosticsPublisher(self, self._reports, values)
 
     def _use(self, urdf: str) -> None:
         """Begin to estimate for this robot."""
         values = self._values
-        self._arm = arm = Arm(urdf, values)
+        arm = Arm(urdf, values)
         if values['wrench_frame']:  # raises for an unknown one
             arm.model.frame_jacobian(np.zeros(len(arm.joints)), values['wrench_frame'])
-        self._description = urdf
+        self._arm, self._description = arm, urdf
         self._messages = {topic: JointState(name=list(arm.joints)) for topic in FIELDS}
         self._say_event(0, OK, 'no contact yet', {})
         self.get_logger().info(
@@ -134,18 +131,13 @@ class ArmNode(TimedNode):
         )
 
     def _on_description(self, message: String) -> None:
-        if self._arm is not None:
-            if message.data != self._description:
-                self._warn(
-                    f'a second robot on {self._topic} is ignored: start the node again for it'
-                )
-            return
-        try:
-            self._use(message.data)
-        except ConfigurationError as error:
-            self._arm = None
-            self._problems['robot'] = str(error)
-            self.get_logger().error(str(error))
+        if self._arm is None:
+            try:
+                self._use(message.data)
+            except ConfigurationError as error:
+                self._warn(str(error))
+        elif message.data != self._description:
+            self._warn(f'a second robot on {self._topic} is ignored: start the node again for it')
 
     def _on_sample(self, message: JointState) -> None:
         """Take a message, if it is of this arm."""
@@ -153,21 +145,19 @@ class ArmNode(TimedNode):
         if arm is None:
             return
         try:
-            with_velocity = self._values['measurement'] == 'velocity'
-            stamp, arrays = joint_sample(message, arm.joints, with_velocity)
+            stamp, arrays = joint_sample(message, arm)
         except ConfigurationError as error:
             if not self._estimate or {*arm.joints} & {*message.name}:  # else of another robot
                 self._warn(f'{error}: no estimate from it')
             return
         estimate = arm.take(stamp, *arrays)
         if arm.problem in MEANT:
-            count = arm.counters[arm.problem]
-            self._warn(f'{MEANT[arm.problem]} ({count} so far)', arm.problem)
+            anew = ': the estimates began anew' if arm.problem in ANEW else ''
+            self._warn(f'{MEANT[arm.problem]}{anew} ({arm.counters[arm.problem]} so far)')
         if arm.doubts.text:
-            self._warn(arm.doubts.text, 'payload' if arm.doubts.payload else 'doubt')
+            self._warn(arm.doubts.text)
         if estimate is not None:
-            self._latest = perf_counter()
-            self._estimate = estimate
+            self._latest, self._estimate = perf_counter(), estimate
             self._tell(arm, estimate)
             self._publish(arm, estimate)
 
@@ -186,7 +176,9 @@ class ArmNode(TimedNode):
                 heard[topic].publish(message)
         if publisher := heard.get('external_wrench'):
             frame = self._values['wrench_frame']
-            (wrench, self._near), message = arm.wrench(estimate, frame), WrenchStamped()
+            (wrench, near_singular), message = arm.wrench(estimate, frame), WrenchStamped()
+            if near_singular:
+                self._problems['near'] = 'near a singular posture: part of the wrench is not seen'
             message.header.stamp, message.header.frame_id = stamp, frame
             message.wrench.force, message.wrench.torque = (
                 Vector3(x=x, y=y, z=z) for x, y, z in (wrench[:3], wrench[3:])
@@ -216,13 +208,10 @@ class ArmNode(TimedNode):
         message = array_of(self, when, [report], self._values['hardware_id'])
         self._outputs['event'].publish(message)
 
-    def _warn(self, text: str, kind: str = '') -> None:
+    def _warn(self, text: str) -> None:
         """Log a problem, each kind at most every `QUIET` seconds, and report it."""
-        now, kind = perf_counter(), kind or text
+        now, kind = perf_counter(), text[:15]  # without names and numbers, which may change
         if now - self._logged.get(kind, -np.inf) > QUIET:
-            if len(self._logged) > 100:  # names that change all the time
-                self._logged.clear()
-                self._problems.clear()
             self._logged[kind] = now
             self.get_logger().warning(text)
         self._problems[kind] = text
@@ -243,12 +232,10 @@ class ArmNode(TimedNode):
             if self._contact:
                 self._contact = None
                 self._say_event(0, STALE, f'no usable sample {since}: contact is not known', {})
-        report.find(WARN, 'near a singular posture: part of the wrench is not seen', self._near)
         report.values |= {f'samples {what}': n for what, n in self._arm.counters.items()}
-        estimate = self._estimate
-        if estimate is not None:
-            report.values['log odds of contact'] = float(estimate.log_odds)
-            report.values['contact'] = estimate.link or 'none'
+        if self._estimate is not None:
+            report.values['log odds of contact'] = self._estimate.log_odds
+            report.values['contact'] = self._estimate.link or 'none'
         return [report]
 
     def _prepare(self, values: Parameters, _: Mapping[str, Value]) -> Parameters:
@@ -262,10 +249,10 @@ class ArmNode(TimedNode):
         self._diagnostics.adopt(values)
 
     def _serve(
-        self, name: str, text: str, _: Trigger.Request, response: Trigger.Response
+        self, name: str, _: Trigger.Request, response: Trigger.Response
     ) -> Trigger.Response:
         response.success = self._estimate is not None
-        response.message = text if response.success else 'there is no estimate yet'
+        response.message = SERVICES[name] if response.success else 'there is no estimate yet'
         if response.success:
             getattr(self._arm, name)()
         self.get_logger().info(f'{name}: {response.message}')

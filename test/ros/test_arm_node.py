@@ -64,7 +64,7 @@ def limb(launch, user):
     limb.wait_said('waiting for the robot on /limb/robot_description')
     limb.wait_status('arm', ERROR, 'no robot yet')
     limb.description.publish(String(data='rubbish'))
-    limb.wait_said('robot description: expected the XML of a URDF')
+    limb.wait_said('robot description: expected a URDF, got')
     limb.description.publish(String(data=URDF))
     limb.wait_said('estimating the external torques of turn, shoulder, elbow')
     # Estimates are lost until the node's publishers have found who listens.

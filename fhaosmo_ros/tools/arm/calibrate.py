@@ -57,7 +57,7 @@ def _calibrate(arguments: argparse.Namespace, stop: Stop) -> None:
         unknown = {'payload': [0.0] * 4} if arguments.payload else {'calibration_file': ''}
         arm = Arm(urdf, values | unknown)
         model, parameters = arm.model, arm.parameters
-        stamps, rows = zip(*joint_samples(reader, arguments.topic, arm.joints, False), strict=True)
+        stamps, rows = zip(*joint_samples(reader, arguments.topic, arm), strict=True)
         when, samples = np.array(stamps), np.array(rows)
         newest = np.maximum.accumulate(np.concatenate([[0], when[:-1]]))
         good = np.isfinite(samples).all(axis=(1, 2)) & (when > newest)

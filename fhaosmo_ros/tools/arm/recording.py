@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from fhaosmo_ros.core.arm.arm import Arm
 from fhaosmo_ros.core.parameters.arm import ARM_PARAMETERS
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.files import load
@@ -54,30 +55,22 @@ def description(reader: BagReader, arguments: argparse.Namespace) -> str:
 
 
 def joint_samples(
-    reader: BagReader, topic: str, joints: tuple[str, ...], with_velocity: bool
+    reader: BagReader, topic: str, arm: Arm
 ) -> Iterator[tuple[int, list[NDArray[np.float64]]]]:
     """
     Yield the samples that hold all joints; see `joint_sample`.
 
-    Raises
-    ------
-    ConfigurationError
-        No message has all joints, with positions and efforts.
-
+    Raise ConfigurationError if there are none.
     """
-    if not reader.count(topic):
-        raise ConfigurationError(f'{reader.path}: expected messages on {topic}, got none')
-    found, problem = False, ''
+    problem: ConfigurationError | str | None = 'none'
     for _, _, message, _ in progress(
         reader.objects([topic]), total=reader.count(topic), unit='message', desc='read'
     ):
         try:
-            sample = joint_sample(message, joints, with_velocity)
+            yield joint_sample(message, arm)
+            problem = None
         except ConfigurationError as error:
-            problem = str(error)
-            continue
-        found = True
-        yield sample
-    if not found:
-        expected = f'joint states of {", ".join(joints)} on {topic}'
-        raise ConfigurationError(f'{reader.path}: expected {expected}, got: {problem}')
+            problem = problem and error
+    if problem:
+        expected = f'joint states of {", ".join(arm.joints)} in messages on {topic}'
+        raise ConfigurationError(f'{reader.path}: expected {expected}, got {problem}')

@@ -2,9 +2,10 @@
 """Estimate external torques from a bag, by the code of the node."""
 
 import argparse
+from collections.abc import Iterable
 import csv
 from pathlib import Path
-from typing import IO
+from typing import Any
 
 from fhaosmo_ros.core.arm.arm import Arm
 from fhaosmo_ros.stop_signals import Stop
@@ -16,7 +17,6 @@ from fhaosmo_ros.tools.arm.recording import (
 )
 from fhaosmo_ros.tools.bags.reader import BagReader
 from fhaosmo_ros.tools.cli.command import Output, run_command
-import numpy as np
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -38,29 +38,27 @@ def _replay(arguments: argparse.Namespace, stop: Stop) -> None:
     with stop.raising(), BagReader(arguments.bag) as reader:
         arm = Arm(description(reader, arguments), arm_parameters(arguments))
         with Output(arguments.output, arguments.force) as output:
-            with output.path.open('w', newline='', encoding='utf-8') as file:
-                contacts = _write(arm, reader, arguments.topic, file)
-            print(f'{arm.counters["used"]} samples used, {contacts} contacts: {output.keep()}')
+            contacts = _write(arm, joint_samples(reader, arguments.topic, arm), output.path)
+            print(f'{arm.counters.pop("used", 0)} samples used, {contacts} contacts: {output.keep()}')
     for what, count in arm.counters.items():
-        if what != 'used':
-            print(f'{what}: {count} samples')
+        print(f'{what}: {count} samples')
 
 
-def _write(arm: Arm, reader: BagReader, topic: str, file: IO[str]) -> int:
+def _write(arm: Arm, samples: Iterable[tuple[int, Any]], path: Path) -> int:
     """Write a line for each estimate; return how many contacts began."""
-    table, contacts, touched, names = csv.writer(file), 0, False, arm.joints
-    table.writerow([
-        'stamp_ns', *names, *(f'{name}_deviation' for name in names), 'log_odds', 'link',
-    ])  # fmt: skip
-    with_velocity = arm.parameters['measurement'] == 'velocity'
-    for stamp, arrays in joint_samples(reader, topic, names, with_velocity):
-        found = arm.take(stamp, *arrays)
-        if found is None:
-            continue
-        contacts += found.contact and not touched
-        touched = found.contact
-        numbers = np.concatenate([found.external_torque, found.standard_deviation])
+    contacts, touched, names = 0, False, arm.joints
+    with path.open('w', newline='', encoding='utf-8') as file:
+        table = csv.writer(file)
         table.writerow([
-            found.stamp, *(f'{x:.9g}' for x in numbers), f'{found.log_odds:.6g}', found.link,
+            'stamp_ns', *names, *(f'{name}_deviation' for name in names), 'log_odds', 'link',
         ])  # fmt: skip
+        for stamp, arrays in samples:
+            if (found := arm.take(stamp, *arrays)) is None:
+                continue
+            contacts += found.contact and not touched
+            touched = found.contact
+            numbers = *found.external_torque, *found.standard_deviation
+            table.writerow([
+                found.stamp, *(f'{x:.9g}' for x in numbers), f'{found.log_odds:.6g}', found.link,
+            ])  # fmt: skip
     return contacts
