@@ -14,11 +14,7 @@ def joint_sample(message: Any, arm: Arm) -> tuple[int, list[NDArray[np.float64]]
     """
     Return what `Arm.take` needs: the stamp in ns, and position, effort and perhaps velocity.
 
-    Raises
-    ------
-    ConfigurationError
-        A joint, a number or the stamp is missing.
-
+    Raise ConfigurationError where a joint, a number or the stamp is missing.
     """
     names, arrays = list(message.name), []
     if missing := [name for name in arm.joints if name not in names]:

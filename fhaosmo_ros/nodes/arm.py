@@ -13,22 +13,9 @@ from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.files import complete
 from fhaosmo_ros.core.parameters.tables import ARM_NODE_PARAMETERS
 from fhaosmo_ros.messages.joints import joint_sample
-from fhaosmo_ros.nodes.middleware.diagnostics import (
-    array_of,
-    DiagnosticsPublisher,
-    ERROR,
-    OK,
-    Report,
-    STALE,
-    WARN,
-)
-from fhaosmo_ros.nodes.middleware.endpoints import (
-    check_overrides,
-    create_publisher,
-    LATCHED,
-    Listeners,
-    SENSOR_QOS,
-)
+from fhaosmo_ros.nodes.middleware import diagnostics, endpoints
+from fhaosmo_ros.nodes.middleware.diagnostics import ERROR, OK, STALE, WARN
+from fhaosmo_ros.nodes.middleware.endpoints import LATCHED, SENSOR_QOS
 from fhaosmo_ros.nodes.middleware.messages import time_message
 from fhaosmo_ros.nodes.middleware.parameters import built_in, NodeParameters
 from fhaosmo_ros.nodes.middleware.simulated_time import TimedNode
@@ -88,7 +75,7 @@ class ArmNode(TimedNode):
         super().__init__(
             'arm', parameter_overrides=built_in(given), enable_logger_service=True, **options
         )
-        check_overrides(self, given, [f'~/{topic}' for topic in TOPICS])
+        endpoints.check_overrides(self, given, [f'~/{topic}' for topic in TOPICS])
         self._values = values
         self._arm: Arm | None = None
         self._description = ''
@@ -98,11 +85,11 @@ class ArmNode(TimedNode):
         self._contact: bool | None = False  # None: not known
         self._estimate: ArmEstimate | None = None
         self._outputs = {
-            topic: create_publisher(self, kind, f'~/{topic}', latched=topic == 'event')
+            topic: endpoints.create_publisher(self, kind, f'~/{topic}', latched=topic == 'event')
             for topic, kind in TOPICS.items()
             if topic != 'external_wrench' or values['wrench_frame']
         }
-        self._listeners = Listeners(self._outputs)
+        self._listeners = endpoints.Listeners(self._outputs)
         NodeParameters(self, values, self._prepare, self._adopt)
         if values['robot_description_file']:
             self._use(text_of(values, 'robot_description_file', 'a URDF'))
@@ -113,7 +100,7 @@ class ArmNode(TimedNode):
         self.create_subscription(JointState, values['input_topic'], self._on_sample, SENSOR_QOS)
         for name in SERVICES:
             self.create_service(Trigger, f'~/{name}', partial(self._serve, name))
-        self._diagnostics = DiagnosticsPublisher(self, self._reports, values)
+        self._diagnostics = diagnostics.DiagnosticsPublisher(self, self._reports, values)
 
     def _use(self, urdf: str) -> None:
         """Begin to estimate for this robot."""
@@ -201,11 +188,11 @@ class ArmNode(TimedNode):
         self._say_event(estimate.stamp, WARN if estimate.contact else OK, text, values)
 
     def _say_event(self, stamp: int, level: bytes, text: str, values: dict[str, str]) -> None:
-        report = Report('contact')
+        report = diagnostics.Report('contact')
         report.find(level, text)
         report.values = values
         when = time_message(stamp) if stamp else self.get_clock().now().to_msg()
-        message = array_of(self, when, [report], self._values['hardware_id'])
+        message = diagnostics.array_of(self, when, [report], self._values['hardware_id'])
         self._outputs['event'].publish(message)
 
     def _warn(self, text: str) -> None:
@@ -216,8 +203,8 @@ class ArmNode(TimedNode):
             self.get_logger().warning(text)
         self._problems[kind] = text
 
-    def _reports(self) -> list[Report]:
-        report = Report('arm')
+    def _reports(self) -> list[diagnostics.Report]:
+        report = diagnostics.Report('arm')
         for problem in self._problems.values():
             report.find(WARN, problem)
         self._problems.clear()

@@ -64,33 +64,17 @@ ANEW = ('clock set back', 'restarts', 'jumped', 'diverged')
 
 
 class ArmEstimate(NamedTuple):
-    """
-    What is estimated at one sample; of a run, with a row for each, NaN where it was not used.
+    """What is estimated at a sample; of a run, with a row for each, NaN where it was not used."""
 
-    Attributes
-    ----------
-    stamp : int
-        Of the sample, ns.
-    position, velocity, external_torque : (n,) array
-        rad, rad/s, N m; m, m/s, N for a prismatic joint.
-    covariance : (n, n) array
-        Of external_torque.
-    log_odds : float
-        Natural logarithm of the odds of contact.
-    contact : bool
-    link : str
-        The likeliest one by the samples of the contact, mostly of the last quarter of a second;
-        also at the first one after it, else empty.
-
-    """
-
-    stamp: Any
-    position: Floats
-    velocity: Floats
-    external_torque: Floats
-    covariance: Floats
-    log_odds: Any
-    contact: Any
+    stamp: Any  # int, of the sample, ns
+    position: Floats  # (n,) rad; m for a prismatic joint
+    velocity: Floats  # (n,) rad/s; m/s
+    external_torque: Floats  # (n,) N m; N
+    covariance: Floats  # (n, n) of external_torque
+    log_odds: Any  # float, natural logarithm of the odds of contact
+    contact: Any  # bool
+    # str, the likeliest one by the samples of the contact, mostly of the last quarter of a second;
+    # also at the first one after it, else empty.
     link: Any
 
     @property
@@ -136,14 +120,9 @@ class Arm:
     """
 
     def __init__(
-        self,
-        urdf: str,
-        parameters: Mapping[str, Any] | None = None,
-        /,
-        *,
-        calibration: Calibration | None = None,
-        **named: Any,
-    ) -> None:
+        self, urdf: str, parameters: Mapping[str, Any] | None = None, /, *,
+        calibration: Calibration | None = None, **named: Any,
+    ) -> None:  # fmt: skip
         p = self.parameters = ARM_PARAMETERS.complete(parameters, named)
         if len(p['gravity']) != 3:
             raise ARM_PARAMETERS['gravity'].error(p['gravity'], 'three numbers')

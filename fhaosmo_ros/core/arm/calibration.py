@@ -17,42 +17,19 @@ WIDTHS = (0.01, 0.03, 0.1, 0.3)
 
 @dataclass(frozen=True)
 class Calibration:
-    """
-    What is known of an arm beyond its URDF; zeros where nothing is.
-
-    Attributes
-    ----------
-    joints : (n,) names
-    inertial : (n, 10) array
-        Of each link in Pinocchio's order, without payload.
-    motor_inertia : (n,) array
-        Of rotors, as joints see it, kg m^2.
-    offset : (n,) array
-        Of the measured torque, N m.
-    viscous : (n,) array
-        Friction for a velocity, N m s/rad.
-    coulomb : (n, k) array
-        Friction for tanh(velocity / width) with each of `WIDTHS`, N m.
-    torque_constants : (n,) array
-        N m for one unit of effort.
-    position_noise, torque_noise, model_error : (n,) array
-        As the parameters; 0 for what these say.
-    log_odds : float
-        Of contact, reached once a minute in the free motion; 0 if not known.
-
-    """
+    """What is known of an arm beyond its URDF; zeros where nothing is."""
 
     joints: tuple[str, ...]
-    inertial: Floats
-    motor_inertia: Floats
-    offset: Floats
-    viscous: Floats
-    coulomb: Floats
-    torque_constants: Floats
-    position_noise: Floats
-    torque_noise: Floats
-    model_error: Floats
-    log_odds: float | Floats = 0.0
+    inertial: Floats  # (n, 10) of each link in Pinocchio's order, without payload
+    motor_inertia: Floats  # (n,) of rotors, as joints see it, kg m^2
+    offset: Floats  # (n,) of the measured torque, N m
+    viscous: Floats  # (n,) friction for a velocity, N m s/rad
+    coulomb: Floats  # (n, k) friction for tanh(velocity / width) with each of `WIDTHS`, N m
+    torque_constants: Floats  # (n,) N m for one unit of effort
+    position_noise: Floats  # (n,) as the parameter, which counts where this is 0
+    torque_noise: Floats  # (n,) likewise
+    model_error: Floats  # (n,) likewise
+    log_odds: float | Floats = 0.0  # of contact, once a minute in the free motion; 0: not known
 
     @classmethod
     def of_urdf(cls, model: ArmModel) -> 'Calibration':

@@ -11,8 +11,7 @@ ARM = (
               lower=-100.0, upper=100.0, live=False, lengths='3'),
     Parameter('measurement', 'position',
               'What is measured: positions, or the velocities of the message where the drive '
-              'measures them better.', choices=('position', 'velocity'),
-              live=False),
+              'measures them better.', choices=('position', 'velocity'), live=False),
     Parameter('effort', 'torque',
               'What effort of the message is: joint torque, motor current (times '
               'torque_constants), or torque without that of gravity (as the UR driver publishes).',
@@ -25,25 +24,23 @@ ARM = (
     Parameter('payload', [0.0, 0.0, 0.0, 0.0],
               "Mass (kg) and centre (m) of what the last link carries, in that joint's frame.",
               lower=-1e4, upper=1e4, lengths='4'),
-    Parameter('calibration_file', '', 'YAML file of `calibrate`; empty: the model as it is.',
+    Parameter('calibration_file', '',
+              'YAML file of `calibrate`, whose noises and model error win; empty: the URDF alone.',
               live=False),
     Parameter('position_noise', [2e-5],
               'Standard deviation of the noise of a position, at least: a step of the encoder '
-              'over the root of 12. More is found while the node runs. That of calibration_file '
-              'wins.',
+              'over the root of 12. More is found while the node runs.',
               unit='rad', lower=1e-9, upper=1.0, live=False, lengths='1 or n'),
     Parameter('velocity_noise', [1e-3],
               'Standard deviation of the noise of a velocity, at least; more is found.',
               unit='rad/s', lower=1e-9, upper=100.0, live=False, lengths='1 or n'),
     Parameter('torque_noise', [0.0],
-              'Standard deviation of the noise of a torque, from sample to sample; 0: it is '
-              'found while the node runs. That of calibration_file wins.', unit='N m',
-              lower=0.0, upper=1e6, live=False, lengths='1 or n'),
+              'Standard deviation of the noise of a torque from sample to sample; 0: it is found.',
+              unit='N m', lower=0.0, upper=1e6, live=False, lengths='1 or n'),
     Parameter('model_error', [0.0],
               'Standard deviation of the torque that the model does not explain in free motion, '
-              "such as friction; 0 for 1.5 % of the torque of the arm's own weight. That of "
-              'calibration_file wins.', unit='N m', lower=0.0, upper=1e6, live=False,
-              lengths='1 or n'),
+              "such as friction; 0 for 1.5 % of the torque of the arm's own weight.", unit='N m',
+              lower=0.0, upper=1e6, live=False, lengths='1 or n'),
     Parameter('false_alarms_per_minute', 1.0,
               'How often contact may be reported in free motion.', lower=1e-3, upper=60.0),
 )  # fmt: skip

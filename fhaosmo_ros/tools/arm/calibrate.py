@@ -2,22 +2,18 @@
 """Find what the URDF of an arm does not say, from a recording of free motion."""
 
 import argparse
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from fhaosmo_ros.core.arm.arm import Arm
-from fhaosmo_ros.core.arm.identification import Identified, identify, payload_of_motion
-from fhaosmo_ros.core.arm.model import ArmModel
+from fhaosmo_ros.core.arm.identification import identify, payload_of_motion
+from fhaosmo_ros.core.arm.model import Floats
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.stop_signals import Stop
+from fhaosmo_ros.tools.arm import recording
 from fhaosmo_ros.tools.arm.figure import torque_figure
-from fhaosmo_ros.tools.arm.recording import (
-    add_arm_options,
-    arm_parameters,
-    description,
-    joint_samples,
-)
 from fhaosmo_ros.tools.bags.reader import BagReader
 from fhaosmo_ros.tools.cli.command import Output, run_command
 import numpy as np
@@ -42,68 +38,62 @@ def main(argv: list[str] | None = None) -> int:
         '--payload', action='store_true',
         help='find the payload only; everything else is that of calibration_file',
     )  # fmt: skip
-    add_arm_options(parser)
+    recording.add_arm_options(parser)
     return run_command(parser, argv, _calibrate)
 
 
 def _calibrate(arguments: argparse.Namespace, stop: Stop) -> None:
-    values = arm_parameters(arguments)
+    values = recording.arm_parameters(arguments) | {'measurement': 'position'}
     if arguments.payload and not values.get('calibration_file'):
         raise ConfigurationError(
             '--payload: expected -p calibration_file:=FILE of the arm without payload, got none'
         )
     with stop.raising(), BagReader(arguments.bag) as reader:
-        urdf = description(reader, arguments)
+        urdf = recording.description(reader, arguments)
         unknown = {'payload': [0.0] * 4} if arguments.payload else {'calibration_file': ''}
         arm = Arm(urdf, values | unknown)
-        model, parameters = arm.model, arm.parameters
-        stamps, rows = zip(*joint_samples(reader, arguments.topic, arm), strict=True)
+        stamps, rows = zip(*recording.joint_samples(reader, arguments.topic, arm), strict=True)
         when, samples = np.array(stamps), np.array(rows)
         newest = np.maximum.accumulate(np.concatenate([[0], when[:-1]]))
         good = np.isfinite(samples).all(axis=(1, 2)) & (when > newest)
         t, q, effort = (when[good] - when[good][:1]) * 1e-9, samples[good, 0], samples[good, 1]
         torque = effort
-        if parameters['effort'] == 'gravity_compensated':
-            rest = np.zeros(len(arm.joints))
-            torque = effort + np.array([model.terms(row, rest).gravity for row in q])
+        if arm.parameters['effort'] == 'gravity_compensated':
+            torque = effort + np.array([arm.model.terms(row, 0.0 * row).gravity for row in q])
         if arguments.payload:
-            _payload(arm, t, q, torque)
+            payload, *left = payload_of_motion(arm.model, t, q, torque, arm.calibration)
+            print(_table(arm.joints, 'without', 'with payload', *left))
+            numbers = ', '.join(f'{x:.4g}' for x in payload)
+            print(f'\npayload: [{numbers}]    # kg and m, in the frame of {arm.joints[-1]}')
             return
         constants: Any = 1.0
-        if parameters['effort'] == 'current':
-            given = np.array(parameters['torque_constants'])
+        if arm.parameters['effort'] == 'current':
+            given = np.array(arm.parameters['torque_constants'])
             constants = np.where(given == 1.0, 0.0, given)
-        found = identify(model, t, q, torque, torque_constants=constants)
+        found = identify(arm.model, t, q, torque, torque_constants=constants)
         # The log-odds of contact that this free motion reaches once a minute.
-        free = Arm(urdf, {**values, 'measurement': 'position'}, calibration=found.calibration)
+        free = Arm(urdf, values, calibration=found.calibration)
         odds = np.nan_to_num(free.run(t, q, effort).log_odds, nan=-np.inf)
         seconds = t.astype(int)
         peaks = np.sort([np.max(odds[seconds == s]) for s in np.unique(seconds)])[::-1]
-        level = float(max(peaks[min(int(len(peaks) / 60.0), len(peaks) - 1)], LEAST))
-    print(_report(model, found))
+        level = max(float(peaks[len(peaks) // 60]), LEAST)
+    print('In parts of the recording that were held out:')
+    print(_table(arm.joints, 'URDF', 'calibrated', found.before, found.after))
+    print(*found.notes, sep='\n')
     with Output(arguments.output, arguments.force) as output:
         text = replace(found.calibration, log_odds=level).dumps()
         output.path.write_text(text, encoding='utf-8')
-        print(f'\ncalibration: {output.keep()}')
+        print(f'calibration: {output.keep()}')
     with Output(arguments.output.with_suffix('.png'), arguments.force) as output:
-        torque_figure(model, found).savefig(output.path, dpi=110)
+        torque_figure(arm.joints, found).savefig(output.path, dpi=110)
         print(f'figure:      {output.keep()}')
 
 
-def _payload(arm: Arm, t: Any, q: Any, torque: Any) -> None:
-    """Print the payload as a parameter."""
-    payload, before, after = payload_of_motion(arm.model, t, q, torque, arm.calibration)
-    numbers = ', '.join(f'{x:.4g}' for x in payload)
-    for name, b, a in zip(arm.joints, before, after, strict=True):
-        print(f'{name}: unexplained {b:.3g} N m without, {a:.3g} N m with the payload')
-    print(f'\npayload: [{numbers}]    # kg and m, in the frame of {arm.joints[-1]}')
-
-
-def _report(model: ArmModel, found: Identified) -> str:
-    """Return a table: what is left unexplained in parts that were held out."""
-    width = max(map(len, model.joints))
-    lines = [f'{"":{width}}   unexplained torque, N m (RMS, held out)',
-             f'{"joint":{width}}{"URDF":>12}{"calibrated":>12}{"ratio":>8}']  # fmt: skip
-    for name, before, after in zip(model.joints, found.before, found.after, strict=True):
-        lines.append(f'{name:{width}}{before:12.3g}{after:12.3g}{after / before:8.2f}')
-    return '\n'.join([*lines, *found.notes])
+def _table(joints: Sequence[str], without: str, with_: str, *left: Floats) -> str:
+    """Return what is left unexplained of the joints' torques, without and with what was found."""
+    width = max(map(len, joints))
+    lines = [f'{"":{width}}   unexplained torque, N m (RMS)',
+             f'{"joint":{width}}{without:>12}{with_:>14}{"ratio":>8}']  # fmt: skip
+    for name, before, after in zip(joints, *left, strict=True):
+        lines.append(f'{name:{width}}{before:12.3g}{after:14.3g}{after / before:8.2f}')
+    return '\n'.join(lines)

@@ -9,12 +9,7 @@ from typing import Any
 
 from fhaosmo_ros.core.arm.arm import Arm
 from fhaosmo_ros.stop_signals import Stop
-from fhaosmo_ros.tools.arm.recording import (
-    add_arm_options,
-    arm_parameters,
-    description,
-    joint_samples,
-)
+from fhaosmo_ros.tools.arm import recording
 from fhaosmo_ros.tools.bags.reader import BagReader
 from fhaosmo_ros.tools.cli.command import Output, run_command
 
@@ -30,16 +25,18 @@ def main(argv: list[str] | None = None) -> int:
         '-o', '--output', type=Path, default=Path('external_torque.csv'), metavar='FILE',
         help='table to write (default: %(default)s)',
     )  # fmt: skip
-    add_arm_options(parser)
+    recording.add_arm_options(parser)
     return run_command(parser, argv, _replay)
 
 
 def _replay(arguments: argparse.Namespace, stop: Stop) -> None:
     with stop.raising(), BagReader(arguments.bag) as reader:
-        arm = Arm(description(reader, arguments), arm_parameters(arguments))
+        arm = Arm(recording.description(reader, arguments), recording.arm_parameters(arguments))
+        samples = recording.joint_samples(reader, arguments.topic, arm)
         with Output(arguments.output, arguments.force) as output:
-            contacts = _write(arm, joint_samples(reader, arguments.topic, arm), output.path)
-            print(f'{arm.counters.pop("used", 0)} samples used, {contacts} contacts: {output.keep()}')
+            contacts = _write(arm, samples, output.path)
+            used = arm.counters.pop('used', 0)
+            print(f'{used} samples used, {contacts} contacts: {output.keep()}')
     for what, count in arm.counters.items():
         print(f'{what}: {count} samples')
 
