@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 from fhaosmo_ros.core.arm.bank import Bank
 from fhaosmo_ros.core.arm.calibration import Calibration
 from fhaosmo_ros.core.arm.doubts import Doubts
-from fhaosmo_ros.core.arm.model import ArmModel, Terms
+from fhaosmo_ros.core.arm.model import ArmModel
 from fhaosmo_ros.core.arm.samples import Clock, Noise, Samples
 from fhaosmo_ros.core.parameters.arm import ARM_PARAMETERS
 from fhaosmo_ros.core.parameters.declaration import Parameters
@@ -301,16 +301,16 @@ class Arm:
             return None
         h, speed = samples.h, samples.speed
         if self._velocity is None:
-            terms, drive = self._first
+            mass, drive = self._first
             wide = 2.0 * self._variance / (h * h if self._of_position else 1.0)
-            spread = (terms.mass * wide) @ terms.mass.T
-            bank.start(terms.mass, drive, terms.mass @ speed, spread, self._model_variance)
+            spread = (mass * wide) @ mass.T
+            bank.start(mass, drive, mass @ speed, spread, self._model_variance)
         if self._velocity is None or not self._of_position:
             self._velocity = self._sliding = speed.copy()
         self._sliding = self._sliding - np.expm1(-h / SLIDING) * (speed - self._sliding)
-        terms, drive = self._drive(q, self._velocity, torque, self._sliding)
+        mass, drive = self._drive(q, self._velocity, torque, self._sliding)
         bank.step(
-            h, terms.mass, samples.change, self._variance, samples.vague, drive,
+            h, mass, samples.change, self._variance, samples.vague, drive,
             self._torque_variance, self._reach,
         )  # fmt: skip
         self.doubts.take(h, q, torque, bank.mean[2])
@@ -331,7 +331,11 @@ class Arm:
             self._looked = stamp
             reach, shares = self.model.reach_of_links(q), np.ones(len(q))
             if self._contact:
-                own = self._likelihoods(torques, covariance, reach)
+                # For each link how likely a force on it makes this torque, as a logarithm.
+                size = torques @ torques / np.maximum(np.trace(reach, axis1=1, axis2=2), 1e-12)
+                spread = covariance + size[:, np.newaxis, np.newaxis] * reach
+                missed = np.linalg.solve(spread, np.tile(torques[:, np.newaxis], (len(q), 1, 1)))
+                own = -0.5 * (np.linalg.slogdet(spread)[1] + missed[..., 0] @ torques)
                 self._evidence = KEEP * self._evidence + own if touched else own
                 likely = np.exp(self._evidence - np.max(self._evidence))
                 shares = likely / np.sum(likely) + ELSEWHERE
@@ -341,9 +345,9 @@ class Arm:
 
     def _drive(
         self, q: Floats, velocity: Floats, torque: Floats, sliding: Floats
-    ) -> tuple[Terms, Floats]:
+    ) -> tuple[Floats, Floats]:
         """
-        Return the terms, and u = torque - friction + C^T qd - g.
+        Return M, and u = torque - friction + C^T qd - g.
 
         Friction is that of the velocity `sliding`: of encoders alone, because the estimate M^-1 p
         would feed its own error of friction back, worst at joints of little inertia.
@@ -354,14 +358,7 @@ class Arm:
             drive -= self.calibration.friction(sliding)
         if self._with_gravity:
             drive -= terms.gravity
-        return terms, drive
-
-    def _likelihoods(self, torque: Floats, covariance: Floats, reach: Floats) -> Floats:
-        """Return for each link how likely a force on it makes this torque, as a logarithm."""
-        size = torque @ torque / np.maximum(np.trace(reach, axis1=1, axis2=2), 1e-12)
-        spread = covariance + size[:, np.newaxis, np.newaxis] * reach
-        missed = np.linalg.solve(spread, np.tile(torque[:, np.newaxis], (len(size), 1, 1)))
-        return np.asarray(-0.5 * (np.linalg.slogdet(spread)[1] + missed[..., 0] @ torque))
+        return terms.mass, drive
 
     def run(
         self, t: ArrayLike, q: ArrayLike, effort: ArrayLike, velocity: ArrayLike | None = None

@@ -15,6 +15,7 @@ from fhaosmo_ros.core.arm.model import ArmModel
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.linalg import block_diag
 from scipy.optimize import least_squares
 from scipy.signal import butter, sosfiltfilt
 
@@ -288,11 +289,9 @@ class _Regression:
         unit = np.sqrt(np.maximum(links[:, :1], 1e-3)) * np.array([LEVER, LEVER, LEVER, 1.0])
         units = unit[:, :, np.newaxis] * unit[:, np.newaxis, :]
         shape = self._model.pseudo_inertias() / units[..., np.newaxis]
+        of_links = block_diag(*shape.reshape(n, 16, 10)) * self._scale[: 10 * n]
         map_ = np.zeros((17 * n, len(right)))
-        for i in range(n):
-            own = slice(10 * i, 10 * i + 10)
-            map_[16 * i : 16 * i + 16, own] = shape[i].reshape(16, 10) * self._scale[own]
-        map_[16 * n :, 10 * n : 11 * n] = np.eye(n)
+        map_[:, : 11 * n] = block_diag(of_links, np.eye(n))
         start = np.concatenate([np.einsum('iabk,ik->iab', shape, links).ravel(), np.zeros(n)])
         # As stiff as the data in the middle between the directions it knows well and hardly.
         rate = float(np.sqrt(np.prod(np.linalg.eigvalsh(normal)[[0, -1]])))
