@@ -177,9 +177,9 @@ class ArmNode(TimedNode):
         if estimate.contact == self._contact:
             return
         self._contact = estimate.contact
-        at, values = estimate.link, {'link': estimate.link, 'log odds': f'{estimate.log_odds:.3g}'}
+        at, values = estimate.link, {'link': estimate.link, 'log odds': estimate.log_odds}
         for name, torque in zip(arm.joints, estimate.external_torque, strict=True):
-            values[f'external torque {name}'] = f'{torque:.4g}'
+            values[f'external torque {name}'] = torque
         if estimate.contact:
             text = f'contact, most likely at {at}'
             self.get_logger().warning(f'event: {text}', throttle_duration_sec=QUIET)
@@ -187,7 +187,7 @@ class ArmNode(TimedNode):
             text = f'contact has ended{at and f", most likely it was at {at}"}'
         self._say_event(estimate.stamp, WARN if estimate.contact else OK, text, values)
 
-    def _say_event(self, stamp: int, level: bytes, text: str, values: dict[str, str]) -> None:
+    def _say_event(self, stamp: int, level: bytes, text: str, values: dict[str, Any]) -> None:
         report = diagnostics.Report('contact')
         report.find(level, text)
         report.values = values

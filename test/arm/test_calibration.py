@@ -50,6 +50,8 @@ def test_what_the_urdf_leaves_is_explained_also_in_another_motion_and_a_payload_
     payload, before, after = payload_of_motion(model, *other, found.calibration)
     assert payload[0] < 0.01
     assert np.all(after < 1.1 * before)
+    with pytest.raises(ConfigurationError, match='at least 10 s of samples'):
+        payload_of_motion(model, *(array[:1000] for array in other), found.calibration)
 
 
 def test_noise_is_found_and_stays_finite_for_a_quantised_encoder(found):

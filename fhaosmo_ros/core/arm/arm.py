@@ -130,9 +130,7 @@ class Arm:
         self.model = model = ArmModel(urdf, joints=chosen, gravity=p['gravity'])
         self.joints, n = model.joints, len(model.joints)
         if calibration is None and p['calibration_file']:
-            calibration = Calibration.loads(
-                text_of(p, 'calibration_file', 'a file of `calibrate`')
-            )
+            calibration = Calibration.loads(text_of(p, 'calibration_file', 'a YAML file'))
         self._calibrated = calibration is not None
         known = self.calibration = calibration or Calibration.of_urdf(model)
         if known.joints != model.joints:
@@ -235,11 +233,9 @@ class Arm:
         given = effort, q, self._rest if self._of_position else velocity
         self.problem = ''
         try:
-            sample = np.array(given, dtype=np.float64)
+            sample = np.array(given, dtype=np.float64).reshape(3, len(self.joints))
         except (TypeError, ValueError):
             return self._refuse('wrong size')  # or no numbers
-        if sample.shape != (3, len(self.joints)):
-            return self._refuse('wrong size')
         sample[0] *= self._constants
         kind = self._samples.fault(sample)
         if kind >= 0:

@@ -103,11 +103,6 @@ def identify(
 
     """
     n = len(model.joints)
-    if len(t) < LEAST_ROWS or not np.all(np.diff(t) > 0.0) or t[-1] - t[0] < SHORTEST:
-        raise ConfigurationError(
-            f'identify: expected at least {SHORTEST:g} s of samples with increasing times, got '
-            f'{len(t)} samples'
-        )
     problem = _Regression(model, t, q, effort, Calibration.of_urdf(model), torque_constants)
     before = problem.unexplained
     held = ((problem.t - problem.t[0]) // BLOCK).astype(int) % HELD_OUT == HELD_OUT - 1
@@ -157,7 +152,7 @@ def payload_of_motion(
 
     payload = least_squares(
         lambda payload: (missed(payload) / problem.size).ravel(), [0.1, 0.0, 0.0, 0.0],
-        bounds=([0.0, -FARTHEST, -FARTHEST, -FARTHEST], [np.inf, FARTHEST, FARTHEST, FARTHEST]),
+        bounds=([0.0, *[-FARTHEST] * 3], [np.inf, *[FARTHEST] * 3]),
     ).x  # fmt: skip
     return payload, _rms(problem.unexplained), _rms(missed(payload))
 
@@ -177,6 +172,11 @@ class _Regression:
         torque_constants: ArrayLike,
     ) -> None:  # fmt: skip
         n = len(model.joints)
+        if len(t) < LEAST_ROWS or not np.all(np.diff(t) > 0.0) or t[-1] - t[0] < SHORTEST:
+            raise ConfigurationError(
+                f'recording: expected at least {SHORTEST:g} s of samples with increasing times, '
+                f'got {len(t)} samples'
+            )
         self._model = model
         period = float(np.median(np.diff(t)))
         even = np.arange(t[0], t[-1], period)
@@ -229,18 +229,16 @@ class _Regression:
         self, unknown: NDArray[np.intp], by_model: Floats, effort: Floats, own: Floats
     ) -> Floats:
         """Return torque constants by the URDF; where it does not tell, those of the others."""
-        names = self._model.joints
         constants, told = np.zeros(len(unknown)), np.zeros(len(unknown), dtype=bool)
         for k, j in enumerate(unknown):
             # The effort is fitted by the torque, not the torque by the effort: what else is in the
             # effort would make the constant too small. Friction and rotor are taken from both.
             both, others = np.column_stack([by_model[:, j], effort[:, j]]), own[..., j].T
             x, y = (both - others @ np.linalg.lstsq(others, both, rcond=None)[0]).T
-            common, power = x @ y, x @ x
-            if common > 0.0:
-                explained, size = common**2 / (power * (y @ y)), np.sqrt(power / len(x))
+            if x @ y > 0.0:
+                explained, size = (x @ y) ** 2 / (x @ x * (y @ y)), np.sqrt(x @ x / len(x))
                 told[k] = explained > TOLD and size > WEAK * by_model.std(axis=0).max()
-                constants[k] = power / common
+                constants[k] = x @ x / (x @ y)
         if not told.any():
             raise ConfigurationError(
                 'torque_constants: expected them as a parameter, because this motion does not '
@@ -248,8 +246,8 @@ class _Regression:
             )
         usual = float(np.median(constants[told]))
         self.notes += [
-            f'{names[j]}: the torque of a unit of effort cannot be told from this motion; taken '
-            f'for {usual:.3g}, as of the other joints (parameter torque_constants)'
+            f'{self._model.joints[j]}: the torque of a unit of effort cannot be told from this '
+            f'motion; taken for {usual:.3g}, as of the other joints (parameter torque_constants)'
             for j in unknown[~told]
         ]  # fmt: skip
         return np.asarray(np.where(told, constants, usual))

@@ -62,15 +62,15 @@ def joint_samples(
 
     Raise ConfigurationError if there are none.
     """
-    problem: ConfigurationError | str | None = 'none'
+    found, problem = False, 'none'
     for _, _, message, _ in progress(
         reader.objects([topic]), total=reader.count(topic), unit='message', desc='read'
     ):
         try:
             yield joint_sample(message, arm)
-            problem = None
+            found = True
         except ConfigurationError as error:
-            problem = problem and error
-    if problem:
+            problem = str(error)
+    if not found:
         expected = f'joint states of {", ".join(arm.joints)} in messages on {topic}'
         raise ConfigurationError(f'{reader.path}: expected {expected}, got {problem}')
