@@ -3,12 +3,14 @@
 
 from bisect import bisect_left
 from collections import Counter
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager, ExitStack
+from io import BytesIO
 from itertools import zip_longest
+from mmap import ACCESS_READ, mmap
 from operator import itemgetter
 from pathlib import Path
-import struct
+from struct import Struct
 from typing import Any, NamedTuple
 from zlib import crc32
 
@@ -18,10 +20,8 @@ from fhaosmo_ros.messages.fields import Field, find_field, MissingElementError, 
 from fhaosmo_ros.tools.bags.types import TYPES
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
-from mcap.reader import NonSeekingReader
 from mcap.records import Chunk
 from mcap.stream_reader import get_chunk_data_stream
-from mcap.writer import MCAP0_MAGIC
 import numpy as np
 from numpy.typing import NDArray
 from rosbags.highlevel import AnyReader
@@ -32,12 +32,11 @@ import zstandard
 
 ZSTD = b'\x28\xb5\x2f\xfd'
 """Begin of what zstd has compressed; a message in CDR begins with a zero."""
-RECORD = struct.Struct('<BQ')
-"""Of mcap: opcode and length, before the content of each record."""
-MESSAGE = struct.Struct('<HIQQ')
-"""Of mcap: channel, sequence, log time and publish time, before a message in CDR."""
-FOOTER = struct.Struct('<BQQQI8s')
-"""Of mcap: opcode, length, begin of the summary and of its offsets, CRC; then the magic number."""
+RECORD, MESSAGE = Struct('<BQ'), Struct('<HIQQ')
+"""
+Of mcap, in front of each record: opcode and length; and in front of a message in CDR, behind that:
+channel, sequence, log time and publish time.
+"""
 Row = tuple[int, int, int, bytes]
 """Log time and publish time (ns), number of the connection, and message in CDR."""
 
@@ -88,16 +87,20 @@ class BagReader:
         self.path = path
         self.unchecked = False
         self.lacking: Counter[str] = Counter()
-        _expect_bag(path)
         with _readable(path), ExitStack() as stack:
-            for file in path.iterdir() if path.is_dir() else [path]:
-                if file.suffix in ('.mcap', '.db3'):
-                    _expect_whole(file)
+            _expect_bag(path)
             reader = stack.enter_context(AnyReader([path], default_typestore=TYPES))
             self.connections: list[Connection] = list(reader.connections)
             self.types = reader.typestore
             storage: Any = reader.readers[0].storage
             self._storages = storage.storages if path.is_dir() else [storage]
+            for storage in self._storages:
+                if isinstance(storage, McapReader) and storage.bio:
+                    storage.bio.seek(storage.data_end)
+                    summary = storage.bio.read()
+                    crc = int.from_bytes(summary[-12:-8], 'little')
+                    if crc and crc32(summary[:-12]) != crc:
+                        raise ValueError('the summary does not agree with its CRC')
             stored = [c for storage in self._storages for c in storage.connections]
             for topic in {c.topic for c in self.connections}:
                 there = sum(c.msgcount for c in stored if c.topic == topic)
@@ -148,68 +151,67 @@ class BagReader:
             for storage in self._storages:
                 # By the storage's own connections: AnyReader.messages() yields nothing, and says
                 # nothing, where the QoS of metadata.yaml differs from the storage file's.
-                chosen = [c for c in storage.connections if topics is None or c.topic in topics]
-                if not chosen:
+                chosen = {
+                    c.id: c for c in storage.connections if topics is None or c.topic in topics
+                }
+                if not chosen:  # rosbags takes that for all
                     continue
-                names = {c.id: c.topic for c in chosen}
-                counts = dict.fromkeys(names, 0)
-                for time, published, channel, data in self._rows(storage, chosen):
-                    counts[channel] += 1
+                counts = dict.fromkeys(chosen, 0)
+                for time, published, number, data in self._rows(storage, chosen):
+                    counts[number] += 1
                     if data[: len(ZSTD)] == ZSTD:  # metadata.yaml says so, but it may be lost
                         data = zstandard.decompress(data)
-                    yield names[channel], time, data, published
-                for c in chosen:
-                    _expect(c.topic, c.msgcount, counts[c.id])
+                    yield chosen[number].topic, time, data, published
+                for number, c in chosen.items():
+                    _expect(c.topic, c.msgcount, counts[number])
 
-    def _rows(self, storage: Any, chosen: list[Connection]) -> Iterator[Row]:
+    def _rows(self, storage: Any, chosen: Mapping[int, Connection]) -> Iterator[Row]:
+        """Yield messages by log time, with the publish time of mcap, which rosbags leaves out."""
         if not isinstance(storage, McapReader):
             self.unchecked = True
-            for c, stamp, data in storage.messages(chosen):
+            for c, stamp, data in storage.messages(chosen.values()):
                 yield stamp, 0, c.id, data
-        elif storage.chunks:
-            yield from self._chunks(storage, {c.id for c in chosen})
-        else:  # all are kept in memory, to put them in order
-            self.unchecked = True
-            with storage.path.open('rb') as file:
-                topics = [c.topic for c in chosen]
-                found = NonSeekingReader(file, validate_crcs=True).iter_messages(topics)
-                for _, channel, message in found:
-                    yield message.log_time, message.publish_time, channel.id, message.data
-
-    def _chunks(self, storage: McapReader, channels: Collection[int]) -> Iterator[Row]:
-        """Yield messages by log time, with the publish time that rosbags does not give."""
-        # Without message indexes it is not known which channels a chunk holds.
-        chunks = sorted(
-            (c.message_start_time, c.chunk_start_offset)
-            for c in storage.chunks
-            if not c.channel_count or any(map(c.channel_count.get, channels))
-        )
-        rows: list[Row] = []
-        for (_, offset), following in zip_longest(chunks, chunks[1:]):
-            rows += self._chunk(storage, offset, channels)
-            rows.sort(key=itemgetter(0))
-            # Chunks may overlap: what lies behind the next one's begin has to wait.
-            ready = bisect_left(rows, following[0], key=itemgetter(0)) if following else len(rows)
-            yield from rows[:ready]
-            del rows[:ready]
-
-    def _chunk(self, storage: McapReader, at: int, channels: Collection[int]) -> Iterator[Row]:
+            return
         assert storage.bio
-        storage.bio.seek(at + RECORD.size)
-        chunk = Chunk.read(ReadDataStream(storage.bio))
-        self.unchecked |= not chunk.uncompressed_crc
-        stream, size = get_chunk_data_stream(chunk, validate_crc=True)
-        data, at = stream.read(size), 0
-        while at < size:
+        # Without message indexes it is not known which channels a chunk holds.
+        parts = sorted(
+            (c.message_start_time, c.chunk_start_offset, c.chunk_start_offset + c.chunk_length)
+            for c in storage.chunks
+            if not c.channel_count or not chosen.keys().isdisjoint(c.channel_count)
+        )
+        if not storage.chunks:  # all is kept in memory, to put it in order
+            self.unchecked = True
+            parts = [(0, storage.data_start, storage.data_end)]
+        rows: list[Row] = []
+        with mmap(storage.bio.fileno(), 0, access=ACCESS_READ) as file:
+            for (_, begin, end), following in zip_longest(parts, parts[1:]):
+                rows += self._messages(file, begin, end, chosen)
+                rows.sort(key=itemgetter(0))
+                # Chunks may overlap: what lies behind the next one's begin has to wait.
+                ready = len(rows)
+                if following:
+                    ready = bisect_left(rows, following[0], key=itemgetter(0))
+                yield from rows[:ready]
+                del rows[:ready]
+
+    def _messages(
+        self, data: bytes | mmap, at: int, end: int, chosen: Mapping[int, Connection]
+    ) -> Iterator[Row]:
+        """Yield the messages in some records of an mcap file, also those in chunks."""
+        while at < end:
             opcode, length = RECORD.unpack_from(data, at)
-            at += RECORD.size
-            if at + length > size:
+            begin, at = at + RECORD.size, at + RECORD.size + length
+            if at > end:
                 raise ValueError('a record goes beyond the end of its chunk')
             if opcode == Opcode.MESSAGE:
-                channel, _, logged, published = MESSAGE.unpack_from(data, at)
-                if channel in channels:
-                    yield logged, published, channel, data[at + MESSAGE.size : at + length]
-            at += length
+                channel, _, logged, published = MESSAGE.unpack_from(data, begin)
+                if channel in chosen:
+                    yield logged, published, channel, data[begin + MESSAGE.size : at]
+            elif opcode == Opcode.CHUNK:
+                chunk = Chunk.read(ReadDataStream(BytesIO(data[begin:at])))
+                self.unchecked |= not chunk.uncompressed_crc
+                stream, size = get_chunk_data_stream(chunk, validate_crc=True)
+                yield from self._messages(stream.read(size), 0, size, chosen)
 
     def objects(self, topics: Collection[str]) -> Iterator[tuple[str, int, Any, int]]:
         """Yield topic, stamp (ns), message and publish time of the messages of some topics."""
@@ -262,23 +264,24 @@ class BagReader:
             )
         if stamp == 'auto':
             stamp = 'header' if field.header else 'source'
-        kinds = [('time', np.int64), ('stamp', np.int64), ('value', np.float64)]
-        found, count = self._samples(topic, field, stamp), self.count(topic)
-        bar = tqdm(found, topic, count, leave=False, unit='', unit_scale=True, disable=None)
-        rows = np.fromiter(bar, dtype=kinds)
-        return FieldSamples(*(np.ascontiguousarray(rows[name]) for name, _ in kinds))
 
-    def _samples(self, topic: str, field: Field, stamp: str) -> Iterator[tuple[int, int, float]]:
-        for _, time, message, published in self.objects([topic]):
-            try:
-                value = field.value(message)
-            except MissingElementError as error:
-                self.lacking[str(error)] += 1
-                continue
-            if stamp == 'header':
-                yield time, field.stamp(message), value
-            else:
-                yield time, (published if stamp == 'source' else 0) or time, value
+        def rows() -> Iterator[tuple[int, int, float]]:
+            for _, time, message, published in self.objects([topic]):
+                try:
+                    value = field.value(message)
+                except MissingElementError as error:
+                    self.lacking[str(error)] += 1
+                    continue
+                if stamp == 'header':
+                    yield time, field.stamp(message), value
+                else:
+                    yield time, (published if stamp == 'source' else 0) or time, value
+
+        count, kinds = self.count(topic), [('t', np.int64), ('s', np.int64), ('x', np.float64)]
+        bar = tqdm(rows(), topic, count, leave=False, unit='', unit_scale=True, disable=None)
+        with _readable(self.path):  # a damaged count may ask for more memory than there is
+            table = np.fromiter(bar, kinds)
+        return FieldSamples(*(np.ascontiguousarray(table[name]) for name, _ in kinds))
 
 
 def _expect(topic: str, listed: int, there: int) -> None:
@@ -288,42 +291,29 @@ def _expect(topic: str, listed: int, there: int) -> None:
 
 
 def _expect_bag(path: Path) -> None:
-    if path.is_file():
-        if path.suffix in ('.mcap', '.db3'):
-            return
-        found = 'a file that is none'
-        if path.suffix == '.bag':
-            found = f'one of ROS 1: rosbags-convert --src {path} --dst NEW makes one of ROS 2'
-    elif not path.exists():
-        found = 'a path that does not exist'
-    elif (path / 'metadata.yaml').exists():
-        return
-    else:
-        files = sorted(p.name for p in path.iterdir() if p.suffix in ('.mcap', '.db3'))
+    """Raise if a path is no bag, or one that is being written, or was when its writer died."""
+    files = [path] if path.is_file() else sorted(path.iterdir()) if path.is_dir() else []
+    files = [p for p in files if p.suffix in ('.mcap', '.db3')]
+    if path.is_dir() and not (path / 'metadata.yaml').exists():
         found = 'a folder without it'
-        found += f' but {files[0]}: name that file, or run ros2 bag reindex' if files else ''
+        if files:
+            found += f' but {files[0].name}: name that file, or run ros2 bag reindex'
+    elif path.suffix == '.bag':
+        found = f'one of ROS 1: rosbags-convert --src {path} --dst NEW makes one of ROS 2'
+    elif not files and not path.is_dir():
+        found = 'a file that is none' if path.exists() else 'a path that does not exist'
+    else:
+        for file in files:
+            if any(Path(f'{file}{end}').exists() for end in ('-journal', '-wal')):
+                raise ValueError(
+                    f'a file whose writer was killed: `sqlite3 {file} .tables` takes back what is '
+                    'half'
+                )
+        return
     raise ConfigurationError(
         f'bag {path}: expected a bag (a folder with metadata.yaml, or its .mcap or .db3), '
         f'got {found}'
     )
-
-
-def _expect_whole(path: Path) -> None:
-    """Refuse a storage file that was cut, or whose summary does not agree with its CRC."""
-    if any(Path(f'{path}{end}').exists() for end in ('-journal', '-wal')):
-        raise ValueError(
-            f'a file whose writer was killed: `sqlite3 {path} .tables` takes back what is half'
-        )
-    if path.suffix == '.mcap':
-        with path.open('rb') as file:
-            place = file.seek(-FOOTER.size, 2)
-            _, _, start, _, crc, magic = FOOTER.unpack(file.read())
-            if magic != MCAP0_MAGIC:
-                raise ValueError('a file that was cut, or whose writer was killed')
-            if crc and start < place:
-                file.seek(start or place)
-                if crc32(file.read()[:-12]) != crc:
-                    raise ValueError('the summary does not agree with its CRC')
 
 
 @contextmanager
@@ -336,6 +326,6 @@ def _readable(path: Path) -> Iterator[None]:
     except Exception as error:
         text = ' '.join(str(error).split()) or type(error).__name__
         raise ConfigurationError(
-            f'bag {path}: expected a whole bag, got: {text} (`mcap recover`, or .recover of '
-            'sqlite3, saves what is whole)'
+            f'bag {path}: expected a whole bag, got: {text} (where a file was cut or '
+            'damaged, `mcap recover`, or .recover of sqlite3, saves what is whole)'
         ) from None

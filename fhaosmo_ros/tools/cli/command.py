@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 from functools import partial
 import os
 from pathlib import Path
-import re
 import shlex
 import shutil
 import sys
@@ -39,8 +38,8 @@ def run_command(parser: argparse.ArgumentParser, argv: Sequence[str] | None, bod
         What follows the command's name; ``sys.argv[1:]`` by default.
     body : callable
         Gets the parsed arguments and the event. ``arguments.command_line`` is what was typed,
-        without the passwords in URLs, as outputs keep it; ``arguments.ros_arguments`` is the
-        part of it between ``--ros-args`` and ``--``, which a launch file adds to every program.
+        as outputs keep it; ``arguments.ros_arguments`` is the part of it between ``--ros-args``
+        and ``--`` or the end, which a launch file adds to every program.
 
     Returns
     -------
@@ -49,13 +48,17 @@ def run_command(parser: argparse.ArgumentParser, argv: Sequence[str] | None, bod
         130 if it was interrupted. Each but the first is said in one line.
 
     """
-    given = sys.argv[1:] if argv is None else argv
+    given = list(sys.argv[1:] if argv is None else argv)
     if '--version' in given:
         parser.exit(0, f'fhaosmo_ros {__version__}\n')
-    own, ros_arguments = split_ros_arguments(given)
+    own, of_ros = given, []
+    if '--ros-args' in given:
+        begin = given.index('--ros-args')
+        end = given.index('--', begin) if '--' in given[begin:] else len(given)
+        own, of_ros = given[:begin] + given[end + 1 :], given[begin + 1 : end]
     arguments = parser.parse_args(own)
-    arguments.ros_arguments = ros_arguments
-    arguments.command_line = without_password(shlex.join([parser.prog, *given]))
+    arguments.ros_arguments = of_ros
+    arguments.command_line = shlex.join([parser.prog, *given])
     stop = stop_on_signals()
     try:
         return body(arguments, stop) or 0
@@ -66,28 +69,8 @@ def run_command(parser: argparse.ArgumentParser, argv: Sequence[str] | None, bod
         text, code = f'error: {error.strerror or error}{place}', 2
     except Stopped as error:
         text, code = f'interrupted{f", {error}" if str(error) else ""}', 130
-    print(f'{parser.prog}: {without_password(text)}', file=sys.stderr)
+    print(f'{parser.prog}: {text}', file=sys.stderr)
     return code
-
-
-def without_password(text: str) -> str:
-    """Return a text with ``***`` in place of the password of each URL in it."""
-    return re.sub(r'(://[^:/@\s]*:)\S*@', r'\1***@', text)
-
-
-def split_ros_arguments(argv: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Return a command's own arguments, and those between ``--ros-args`` and ``--`` or the end."""
-    own: list[str] = []
-    of_ros: list[str] = []
-    target = own
-    for word in argv:
-        if word == '--ros-args':
-            target = of_ros
-        elif word == '--' and target is of_ros:
-            target = own
-        else:
-            target.append(word)
-    return own, of_ros
 
 
 class Output:
@@ -126,13 +109,12 @@ class Output:
     def __enter__(self) -> 'Output':
         final = self._final
         try:
-            if not self._force and final.exists():
-                folder = final.is_dir()
-                if not folder or any(final.iterdir()):
-                    raise ConfigurationError(
-                        f'output {final}: expected a new name (or --force to replace it), got an '
-                        f'existing {"folder with something in it" if folder else "file"}'
-                    )
+            empty = not final.exists() or (final.is_dir() and not any(final.iterdir()))
+            if not (empty or self._force):
+                raise ConfigurationError(
+                    f'output {final}: expected a new name (or --force to replace it), got an '
+                    f'existing {"folder with something in it" if final.is_dir() else "file"}'
+                )
             shutil.rmtree(self._folder, ignore_errors=True)  # of a run that was killed
             self._folder.mkdir(parents=True)
         except OSError as error:

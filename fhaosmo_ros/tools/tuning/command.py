@@ -47,24 +47,14 @@ def main(argv: list[str] | None = None) -> int:
     add_value_options(
         parser, "parameters: sections of the estimator, the plant and 'tune', or /**"
     )
-    search = parser.add_argument_group('from simulated recordings')
-    add = search.add_argument
     add(
-        '--trials', type=int, default=TRIALS, metavar='N',
-        help='that the study shall hold at the end (default: %(default)s)',
-    )  # fmt: skip
-    add('--jobs', type=int, metavar='N', help='trials at a time (default: one a core)')
-    add('--seed', type=int, default=1, help='of recordings and search (default: %(default)s)')
-    add(
-        '--storage', metavar='URL',
-        help='data base of an Optuna study that several tune share, and that can be continued: '
-        'sqlite:///study.db, postgresql+psycopg://... (default: in memory)',
-    )  # fmt: skip
-    bag = parser.add_argument_group('from a bag')
-    bag.add_argument(
         '--bag', type=Path,
         help='find the gains that are likeliest for its y (of input_topic, input_field)',
     )  # fmt: skip
+    add = parser.add_argument_group('from simulated recordings').add_argument
+    add('--trials', type=int, default=TRIALS, metavar='N', help='default: %(default)s')
+    add('--jobs', type=int, metavar='N', help='trials at a time (default: one a core)')
+    add('--seed', type=int, default=1, help='of recordings and search (default: %(default)s)')
     return run_command(parser, argv, _tune)
 
 
@@ -75,9 +65,18 @@ def _tune(arguments: argparse.Namespace, stop: Stop) -> None:
             f'{arguments.trials}, {arguments.jobs} and {arguments.seed}'
         )
     estimator, tuning = read_parameters(arguments.params_file, arguments.param)
-    make = _search if arguments.bag is None else _identify
     with Output(arguments.output, arguments.force) as output:
-        found = make(arguments, estimator, tuning, stop)
+        if arguments.bag:
+            with stop.raising():
+                found = _of_bag(arguments.bag, estimator, tuning)
+        else:
+            values = TUNE_PARAMETERS.complete(tuning)
+            with stop.raising():
+                training, held_out = simulated(values, arguments.seed)
+                print(f'{len(training)} recordings to train on, {len(held_out)} held out')
+                tuner = Tuner(training, held_out, estimator, values, arguments.seed)
+            jobs = arguments.jobs or os.cpu_count() or 1
+            found = report.of_search(tuner, tuner.search(arguments.trials, jobs, stop.is_set))
         report.save(output.path, arguments.command_line, found)
         folder = output.keep()
     print(f'\n{found.main}\n')
@@ -85,24 +84,8 @@ def _tune(arguments: argparse.Namespace, stop: Stop) -> None:
     print(f'use it: ros2 run fhaosmo_ros estimator --ros-args --params-file {folder}/gains.yaml')
 
 
-def _search(
-    arguments: argparse.Namespace, estimator: dict[str, Any], tuning: dict[str, Any], stop: Stop
-) -> report.Report:
-    """Find the gains for a simulated family."""
-    values = TUNE_PARAMETERS.complete(tuning)
-    with stop.raising():
-        training, held_out = simulated(values, arguments.seed)
-        print(f'{len(training)} recordings to train on, {len(held_out)} held out')
-        tuner = Tuner(training, held_out, estimator, values, arguments.seed)
-    jobs = arguments.jobs or os.cpu_count() or 1
-    result = tuner.search(arguments.trials, jobs, arguments.storage, stop.is_set)
-    return report.of_search(tuner, result)
-
-
-def _identify(
-    arguments: argparse.Namespace, estimator: dict[str, Any], tuning: dict[str, Any], stop: Stop
-) -> report.Report:
-    """Find the gains for what y itself shows."""
+def _of_bag(path: Path, estimator: dict[str, Any], tuning: dict[str, Any]) -> report.Report:
+    """Find the gains for what the y of a bag shows."""
     if others := chosen_otherwise(estimator):
         raise ConfigurationError(
             f'--bag: expected gains of structure levant, got {", ".join(others)} set. Leave that '
@@ -113,20 +96,18 @@ def _identify(
     values = ESTIMATOR_PARAMETERS.complete(given)
     given |= {name: values[name] for name in ('order', 'phi')}
     model = TriangularModel.of(values)
-    with stop.raising():
-        with BagReader(arguments.bag) as reader:
-            inputs = BagInputs(reader, values, model)
-            samples, field = inputs.samples()
-            if field.wraps:
-                samples = samples.unwrapped()
-            u = np.zeros((len(samples.values), len(model.inputs)))
-            if model.used_inputs:
-                u = inputs.at(samples)
-        t = (samples.stamps - samples.stamps[0]) * 1e-9
-        found = identify_input((t, samples.values, u), model, values, given)
-        made = make_gains(found, given)
-        along = run(found, made)
-    return report.of_bag(found, made, along, arguments.bag.resolve().name)
+    with BagReader(path) as reader:
+        inputs = BagInputs(reader, values, model)
+        samples, field = inputs.samples()
+        if field.wraps:
+            samples = samples.unwrapped()
+        u = np.zeros((len(samples.values), len(model.inputs)))
+        if model.used_inputs:
+            u = inputs.at(samples)
+    t = (samples.stamps - samples.stamps[0]) * 1e-9
+    found = identify_input((t, samples.values, u), model, values, given)
+    made = make_gains(found, given)
+    return report.of_bag(found, made, run(found, made), path.resolve().name)
 
 
 def read_parameters(files: list[Path], rules: list[str]) -> tuple[dict[str, Any], dict[str, Any]]:

@@ -130,9 +130,10 @@ def identify_input(
 
     """
     likelihood = _prepared(recorded, model, values, given)
-    decay, orders = given.get('unknown_input_decay') or None, DERIVATIVES
+    decay = given.get('unknown_input_decay') or None
+    first, *others = DERIVATIVES
     if 'unknown_input_derivatives' in given:
-        orders = (given['unknown_input_derivatives'],)
+        first, others = given['unknown_input_derivatives'], []
     with progress(unit='filter', desc='likelihood', leave=False) as bar:
 
         def evaluate(design: Design) -> Evaluation:
@@ -141,18 +142,12 @@ def identify_input(
 
         start = _start(likelihood, evaluate)
         outliers = _leave_out_outliers(likelihood, start)
-        best: Evaluation | None = None
-        for k in orders:
+        best = _fit(evaluate, start.design._replace(derivatives=first), likelihood.period, decay)
+        for k in others:
             design = start.design._replace(derivatives=k)
             richer = _fit(evaluate, design, likelihood.period, decay)
-            if not best or richer.log_likelihood > best.log_likelihood + WORTH:
+            if richer.log_likelihood > best.log_likelihood + WORTH:
                 best = richer
-        assert best
-        if not math.isfinite(best.log_likelihood):
-            raise ConfigurationError(
-                f'y: expected samples that the model can predict, got none that phi = '
-                f'{list(model.phi)} follows: its estimates leave the finite numbers'
-            )
         still = STILL / float(likelihood.samples.h.sum())
         without = evaluate(best.design._replace(bandwidth=still))
     found = Identified(likelihood, best, outliers, quantum(likelihood.samples.y))
@@ -164,6 +159,11 @@ def _refuse(found: Identified, fall: float) -> None:
     """Raise where there are no gains; `fall`: of the log-likelihood if d were 0."""
     likelihood, y, noise = found.likelihood, found.likelihood.samples.y, found.best.noise
     period, bandwidth = likelihood.period, found.best.design.bandwidth
+    if not math.isfinite(found.best.log_likelihood):
+        raise ConfigurationError(
+            f'y: expected samples that the model can predict, got none that phi = '
+            f'{list(likelihood.model.phi)} follows: its estimates leave the finite numbers'
+        )
     silent = noise < NO_NOISE * float(np.std(y)) and not found.quantum
     if silent and not likelihood.fixed:
         raise ConfigurationError(

@@ -9,13 +9,11 @@ themselves, from the user's, or the default ones.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-import hashlib
 from itertools import product
-import json
 import math
 from typing import Any
 
-from fhaosmo_ros.core.observer.configuration import FIXED_GAMMA
+from fhaosmo_ros.core.observer.configuration import FIXED_GAMMA, of_level
 from fhaosmo_ros.core.observer.observer import Observer
 from fhaosmo_ros.core.parameters.declaration import Parameters
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
@@ -39,8 +37,11 @@ HELD_OUT_SEED = 1_000_003
 """Added to the seed: held-out recordings share no random number with the others."""
 MODEL_OF_D = ('unknown_input_size', 'unknown_input_decay')
 """What is searched where gains follow from the model of d."""
-DERIVATIVES, RATES = (0, 1, 2, 3), np.geomspace(0.1, 30.0, 8)
-"""The grid: unknown_input_derivatives, and unknown_input_decay (1/s)."""
+DERIVATIVES, RATES = (0, 1, 2, 3), np.geomspace(0.1, 30.0, 8).tolist()
+GRID: dict[str, Sequence[float]] = {
+    'unknown_input_derivatives': DERIVATIVES,
+    'unknown_input_decay': RATES,  # 1/s
+}
 DECADES = 3.0
 """Powers of ten around its start to which a search in logarithms goes."""
 LOST_TIME, LOST_SAMPLES = 0.1, 20
@@ -102,9 +103,8 @@ class Tuner:
         if kalman:
             self._noise, known = self._kalman_start(own)
             self._fixed = known | own
-            grid = {'unknown_input_derivatives': DERIVATIVES, 'unknown_input_decay': RATES}
-            free = {k: v if k not in own else [own[k]] for k, v in grid.items()}
-            points = [dict(zip(grid, point, strict=True)) for point in product(*free.values())]
+            free = {name: [own[name]] if name in own else grid for name, grid in GRID.items()}
+            points = (dict(zip(free, point, strict=True)) for point in product(*free.values()))
             self._fixed |= _changes(min(points, key=self.evaluate)) | own
         start = self.parameters({})
         self.training(start)  # raises what `evaluate` takes for a bad point
@@ -134,13 +134,6 @@ class Tuner:
         if min(sizes) > 0.0:
             found |= {'noise_size': noise, 'state_sizes': sizes[:-1]}
         return noise, found | {'fuzzy_widths': [WIDTH * noise]}
-
-    @property
-    def _study_name(self) -> str:
-        """Name of the study: a digest of all that its trials depend on."""
-        samples = [recording.y.tobytes() for recording in self.training.recordings]
-        problem = json.dumps([dict(self.tuning), self._fixed, self.space], sort_keys=True)
-        return f'tune-{hashlib.sha256(b"".join([problem.encode(), *samples])).hexdigest()[:16]}'
 
     def parameters(self, values: Values) -> dict[str, Any]:
         """
@@ -176,11 +169,7 @@ class Tuner:
             return math.inf
 
     def search(
-        self,
-        trials: int,
-        jobs: int = 1,
-        storage: str | None = None,
-        stopped: Callable[[], bool] = lambda: False,
+        self, trials: int, jobs: int = 1, stopped: Callable[[], bool] = lambda: False
     ) -> Result:
         """Search as `minimise` does, or until `stopped` returns True after a trial."""
         with progress(total=trials, unit='trial', desc='tune', smoothing=0.05) as bar:
@@ -190,9 +179,8 @@ class Tuner:
                 return stopped()
 
             return minimise(
-                self.evaluate, self.space, trials, self._seed, storage=storage,
-                name=self._study_name, jobs=jobs, on_trial=on_trial,
-            )  # fmt: skip
+                self.evaluate, self.space, trials, self._seed, jobs=jobs, on_trial=on_trial
+            )
 
 
 def _make_space(names: Sequence[str], observer: Observer) -> list[Dimension]:
@@ -202,7 +190,7 @@ def _make_space(names: Sequence[str], observer: Observer) -> list[Dimension]:
     for name in names:
         declared, values, labels = OBSERVER_PARAMETERS[name], [start[name]], [name]
         if isinstance(start[name], list):
-            values = [start[name][min(k, len(start[name]) - 1)] for k in range(observer.levels)]
+            values = [of_level(start[name], k) for k in range(observer.levels)]
             labels = [f'{name}[{k}]' for k in range(observer.levels)]
         for label, value in zip(labels, values, strict=True):
             middle = value or 1.0  # such as unknown_input_decay, which may be 0
@@ -211,9 +199,8 @@ def _make_space(names: Sequence[str], observer: Observer) -> list[Dimension]:
             if name == 'gamma_initial':
                 low, high = start['gamma_min'], start['gamma_max']
             log = 0.0 < 10.0 * low < high
-            space.append(
-                Dimension(label, low, high, min(max(middle if log else value, low), high), log)
-            )
+            begin = min(max(middle if log else value, low), high)
+            space.append(Dimension(label, low, high, begin, log))
     if not space:
         raise ConfigurationError(
             f'expected one of {", ".join(MODEL_OF_D)} to search, got both set'
