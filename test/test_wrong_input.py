@@ -47,7 +47,6 @@ WRONG = {
     'calibrate --bag joints --robot three.urdf': ['messages on /joint_states, got none'],
     'calibrate --bag joints --robot three.urdf --topic /y': ['joint states of turn', 'lacks'],
     # play, record, demo
-    'play bag --delay -1': ['--delay', '0 to 3600', '-1'],
     'play bag --topics /x': ["'/x'", '/y'],
     'play bag --topics /clock': ['expected a message to play'],
     "record -o out --topics 'a b'": ['--topics', "'a b'"],

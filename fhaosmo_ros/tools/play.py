@@ -12,30 +12,20 @@ from fhaosmo_ros.tools.bags.types import serialise, TYPES
 from fhaosmo_ros.tools.cli.command import run_command
 from fhaosmo_ros.topics import TIME
 
-CLOCK = 'rosgraph_msgs/msg/Clock'
-CLOCK_PERIOD = 1_000_000
-"""Longest time between two messages on /clock, in nanoseconds of the bag's time."""
+CLOCK, CLOCK_PERIOD = 'rosgraph_msgs/msg/Clock', 1_000_000  # ns, at most, of the bag's time
+DISCOVERY = 4.0  # seconds: nodes lose what is published before they find the topics
 NEVER_PLAYED = ('/clock', '/rosout', '/parameter_events')
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run the command; return 0 at the end or after Ctrl-C."""
+    """Run the command."""
     parser = argparse.ArgumentParser(prog='play', description="Publish a bag's topics and /clock.")
-    add = parser.add_argument
-    add('bag', type=Path)
-    add('--topics', nargs='+', metavar='TOPIC', help='these only (default: all)')
-    add('--loop', action='store_true', help='begin again at the end, until Ctrl-C')
-    add(
-        '--delay', type=float, default=4.0, metavar='SECONDS',
-        help='begin so long after the topics appear: nodes take up to 3 s to find them and '
-        'lose what is published before that (default: %(default)g)',
-    )  # fmt: skip
+    parser.add_argument('bag', type=Path)
+    parser.add_argument('--topics', nargs='+', metavar='TOPIC', help='these only (default: all)')
     return run_command(parser, argv, _play)
 
 
 def _play(arguments: argparse.Namespace, stop: Stop) -> None:
-    if not 0.0 <= arguments.delay <= 3600.0:
-        raise ConfigurationError(f'--delay: expected 0 to 3600 s, got {arguments.delay:g}')
     # Here, so that --help needs no ROS.
     from fhaosmo_ros.nodes.recording import PrivateNode
 
@@ -50,27 +40,21 @@ def _play(arguments: argparse.Namespace, stop: Stop) -> None:
             if any(q.durability.name == 'TRANSIENT_LOCAL' for q in c.ext.offered_qos_profiles)
         }
         with PrivateNode('fhaosmo_player', arguments.ros_arguments) as node:
-            publish_clock = node.publisher('/clock', CLOCK, False)
-            publish = {}
+            publish_clock, publish = node.publisher('/clock', CLOCK, False), {}
             for topic, kind in topics.items():
                 try:
                     publish[topic] = node.publisher(topic, kind, topic in latched)
                 except LookupError:
                     print(f'play: not played: {topic}: {kind} is not installed here')
             print(f'playing {len(publish)} topics; Ctrl-C ends it', flush=True)
-            if stop.wait(arguments.delay):
-                return
-            while True:
-                now = None
-                for topic, stamp, data, _ in reader.messages(publish):
-                    if now is None:
-                        now, ahead = stamp - 1, stamp - time.monotonic_ns()
-                    while now < stamp:  # the clock goes on between the messages
-                        now = min(now + CLOCK_PERIOD, stamp)
-                        if stop.wait(max(0.0, (now - ahead - time.monotonic_ns()) * 1e-9)):
-                            return
-                        clock = TYPES.types[TIME](*divmod(now, 1_000_000_000))
-                        publish_clock(serialise(CLOCK, clock=clock))
-                    publish[topic](data)
-                if not arguments.loop:
-                    return
+            stop.wait(DISCOVERY)
+            now = ahead = 0
+            for topic, stamp, data, _ in reader.messages(publish):
+                if not now:
+                    now, ahead = stamp - 1, stamp - time.monotonic_ns()
+                while now < stamp:  # the clock goes on between the messages
+                    now = min(now + CLOCK_PERIOD, stamp)
+                    if stop.wait(max(0.0, (now - ahead - time.monotonic_ns()) * 1e-9)):
+                        return
+                    publish_clock(serialise(CLOCK, clock=TYPES.types[TIME](*divmod(now, 10**9))))
+                publish[topic](data)

@@ -10,14 +10,13 @@ from fhaosmo_ros.tools.bags.types import serialise, with_numbers
 from fhaosmo_ros.tools.bags.writer import BagWriter
 from fhaosmo_ros.topics import FLOAT
 import numpy as np
-from numpy.typing import NDArray
 
 DELIMITERS = ',;\t'
 LATEST = 9.2e9
 """Seconds; the largest stamp in nanoseconds is a little more."""
 
 
-def bag_of_table(path: Path, wanted: Sequence[str], used: Sequence[str], bag: Path) -> None:
+def bag_of_table(path: Path, wanted: str, used: Sequence[str], bag: Path) -> None:
     """
     Write the samples of a CSV file to a new bag, each with the time in its line as its stamp.
 
@@ -29,8 +28,9 @@ def bag_of_table(path: Path, wanted: Sequence[str], used: Sequence[str], bag: Pa
     path : path
         Lines of numbers with commas, semicolons, tabs or spaces between them; an empty cell is a
         missing sample. Titles may stand in the first line; without them the columns are 1, 2, ...
-    wanted : sequence of str
-        Titles of the time in seconds, of y and of the known inputs; empty for the first columns.
+    wanted : str
+        Titles of the time in seconds, of y and of the known inputs, separated by commas; empty for
+        the first columns.
     used : sequence of str
         Known inputs that the model uses, in the order of their columns.
     bag : path
@@ -43,28 +43,7 @@ def bag_of_table(path: Path, wanted: Sequence[str], used: Sequence[str], bag: Pa
         no number, or times that are not finite or below 0.
 
     """
-    numbers = _columns(path, wanted, ['the time', 'y', *used])
-    t = numbers[:, 0]
-    bad = np.flatnonzero(~((t >= 0.0) & (t <= LATEST)))
-    if len(bad):
-        raise ConfigurationError(
-            f'{path}: expected times of 0 to {LATEST:g} s, got {t[bad[0]]} in sample {bad[0]}, '
-            'counted from 0'
-        )
-    empty = serialise(FLOAT, data=0.0)
-    columns = [
-        (f'/{name}', with_numbers(empty, its))
-        for name, its in zip(['y', *used], numbers.T[1:], strict=True)
-    ]
-    with BagWriter(bag) as writer:
-        for topic, _ in columns:
-            writer.add(topic, FLOAT)
-        stamps = np.round(t * 1e9).astype(np.int64)
-        writer.write_columns(np.maximum(stamps, 1), columns)  # 0 is a stamp that nobody filled
-
-
-def _columns(path: Path, wanted: Sequence[str], names: Sequence[str]) -> NDArray[np.float64]:
-    """Return those columns of the file that have the wanted titles, (K, len(names))."""
+    names = ['the time', 'y', *used]
     with path.open(encoding='utf-8-sig') as file:
         lines = file.readlines() or ['']
     delimiter = next((mark for mark in DELIMITERS if mark in lines[0]), None)
@@ -73,13 +52,14 @@ def _columns(path: Path, wanted: Sequence[str], names: Sequence[str]) -> NDArray
         titles = [str(k + 1) for k, _ in enumerate(map(_number, titles))]
     except ValueError:
         del lines[0]
-    wanted = wanted or titles[: len(names)]
-    if len(wanted) != len(names):
+    columns = [title.strip() for title in wanted.split(',') if title.strip()]
+    columns = columns or titles[: len(names)]
+    if len(columns) != len(names):
         raise ConfigurationError(
             f'--columns: expected {len(names)} titles, of {", ".join(names)}, got '
-            f'{", ".join(wanted)}'
+            f'{", ".join(columns)}'
         )
-    for title in wanted:
+    for title in columns:
         if title not in titles:
             raise ConfigurationError(
                 f'--columns: expected titles of {path}, which are {", ".join(titles)}, '
@@ -87,11 +67,26 @@ def _columns(path: Path, wanted: Sequence[str], names: Sequence[str]) -> NDArray
             )
     if not lines:
         raise ConfigurationError(f'{path}: expected lines of numbers, got none')
-    places = [titles.index(title) for title in wanted]
+    places = [titles.index(title) for title in columns]
     try:
-        return np.loadtxt(lines, delimiter=delimiter, usecols=places, converters=_number, ndmin=2)
+        t, *numbers = np.loadtxt(
+            lines, delimiter=delimiter, usecols=places, converters=_number, ndmin=2, unpack=True
+        )
     except ValueError as error:
         raise ConfigurationError(f'{path}: expected lines of numbers: {error}') from None
+    bad = np.flatnonzero(~((t >= 0.0) & (t <= LATEST)))
+    if len(bad):
+        raise ConfigurationError(
+            f'{path}: expected times of 0 to {LATEST:g} s, got {t[bad[0]]} in sample {bad[0]}, '
+            'counted from 0'
+        )
+    empty = serialise(FLOAT, data=0.0)
+    messages = {f'/{n}': with_numbers(empty, x) for n, x in zip(names[1:], numbers, strict=True)}
+    with BagWriter(bag) as writer:
+        for topic in messages:
+            writer.add(topic, FLOAT)
+        stamps = np.round(t * 1e9).astype(np.int64)
+        writer.write_columns(np.maximum(stamps, 1), messages)  # 0 is a stamp that nobody filled
 
 
 def _number(text: str) -> float:

@@ -7,10 +7,9 @@ in time order with no message indexes'), as it closes chunks that hold no messag
 rosbag2 names a storage file, so that `ros2 bag reindex` finds it.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 import os
 from pathlib import Path
-import struct
 from typing import Any, NamedTuple
 
 from fhaosmo_ros.tools.bags.reader import BagReader, MESSAGE, RECORD
@@ -132,7 +131,7 @@ class BagWriter:
             self.flush()
 
     def write_columns(
-        self, times: NDArray[np.int64], columns: Sequence[tuple[str, NDArray[np.uint8]]]
+        self, times: NDArray[np.int64], columns: Mapping[str, NDArray[np.uint8]]
     ) -> None:
         """
         Append a message of each topic at each time, all at once.
@@ -141,23 +140,23 @@ class BagWriter:
         ----------
         times : (K,) array of int
             In nanoseconds.
-        columns : sequence of (str, (K, size) array)
-            Topics, and the bytes of their messages in CDR.
+        columns : mapping of str to (K, size) array
+            The bytes of the messages of each topic in CDR.
 
         """
         self.flush()
         stamps = times.astype('<i8').view(np.uint8).reshape(len(times), -1)
+        channels = [self._channels[topic] for topic in columns]
         parts, places, width = [], [], 0
-        for topic, messages in columns:
+        for channel, messages in zip(channels, columns.values(), strict=True):
             size = MESSAGE.size + messages.shape[1]
-            head = RECORD.pack(Opcode.MESSAGE, size) + struct.pack('<HI', self._channels[topic], 0)
+            head = RECORD.pack(Opcode.MESSAGE, size) + MESSAGE.pack(channel, 0, 0, 0)[:-16]
             heads = np.tile(np.frombuffer(head, np.uint8), (len(times), 1))
             parts += [heads, stamps, stamps, messages]
             places.append(width)
             width += RECORD.size + size
-        channels = [self._channels[topic] for topic, _ in columns]
         starts = width * np.arange(len(times))[:, np.newaxis] + places
-        rows = [np.tile(channels, len(times)), np.repeat(times, len(columns)), starts.ravel()]
+        rows = [np.tile(channels, len(times)), np.repeat(times, len(channels)), starts.ravel()]
         self._write_chunk(np.hstack(parts).tobytes(), np.column_stack(rows))
 
     def _write_chunk(self, data: bytes, rows: NDArray[np.int64]) -> None:

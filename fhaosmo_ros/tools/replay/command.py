@@ -20,22 +20,17 @@ from fhaosmo_ros.stop_signals import Stop
 from fhaosmo_ros.tools.bags.inputs import BagInputs
 from fhaosmo_ros.tools.bags.reader import BagReader, FieldSamples
 from fhaosmo_ros.tools.bags.table import bag_of_table
-from fhaosmo_ros.tools.bags.topics import Recorded, recorded_parameters
+from fhaosmo_ros.tools.bags.topics import recorded_parameters
 from fhaosmo_ros.tools.cli.command import Output, run_command
-from fhaosmo_ros.tools.cli.options import (
-    add_parameter_options,
-    channel_parameters,
-    named,
-)
+from fhaosmo_ros.tools.cli.options import add_parameter_options, channel_parameters, named
 from fhaosmo_ros.tools.replay.live_run import find_estimator, LiveRun, UnknownSnapshot
-from fhaosmo_ros.tools.replay.sinks import bag_sink, Rows, TABLES
+from fhaosmo_ros.tools.replay.sinks import Rows, sink, TABLES
 from fhaosmo_ros.topics import ESTIMATES
 import numpy as np
 from numpy.typing import NDArray
 
 BLOCK = 16_384
 """Samples that are estimated, and written, at a time."""
-NONE = np.zeros(0, dtype=np.int64)
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -81,19 +76,17 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _replay(arguments: argparse.Namespace, stop: Stop) -> None:
-    is_table = arguments.bag.suffix == '.csv'
+    path, is_table = arguments.bag, arguments.bag.suffix == '.csv'
     if arguments.columns and not is_table:
-        raise ConfigurationError(f'--columns: expected a .csv file, got {arguments.bag}')
-    bag_name = arguments.bag.resolve().name.removesuffix('.csv' if is_table else '.mcap')
+        raise ConfigurationError(f'--columns: expected a .csv file, got {path}')
+    bag_name = path.resolve().name.removesuffix('.csv' if is_table else '.mcap')
     begin = perf_counter()
     with ExitStack() as stack:
-        path = arguments.bag
         if is_table:
             path = Path(stack.enter_context(TemporaryDirectory()), 'table')
             own = channel_parameters(arguments)
             used = OnlineEstimator(ONLINE_PARAMETERS.part_of(own)).observer.used_inputs
-            titles = [title.strip() for title in arguments.columns.split(',') if title.strip()]
-            bag_of_table(arguments.bag, titles, used, path)
+            bag_of_table(arguments.bag, arguments.columns, used, path)
         reader = stack.enter_context(BagReader(path))
         followed = recorded = live = None
         if not arguments.afresh:
@@ -140,22 +133,17 @@ def _replay(arguments: argparse.Namespace, stop: Stop) -> None:
                 u = inputs.at(samples, estimator.inputs, estimator.reject_inputs)
             parameters = ONLINE_PARAMETERS.defaults() | own
             sinks = [
-                files.enter_context(
-                    TABLES[o.path.suffix](o.path)
-                    if o.path.suffix in TABLES
-                    else bag_sink(o.path, reader, name, estimator.observer, parameters)
-                )
+                files.enter_context(sink(o.path, reader, name, estimator.observer, parameters))
                 for o in outputs
             ]
             for rows in _estimates(estimator, live, samples, u, arguments.smooth):
-                for sink in sinks:
-                    sink(rows)
+                for write in sinks:
+                    write(rows)
         finals = [output.keep() for output in outputs]
-    seconds = perf_counter() - begin
     c = estimator.counters
     print(
         f'{c.accepted} samples used, {c.rejected} rejected, {c.restarts} restarts; '
-        f'{span:.1f} s of data in {seconds:.2f} s'
+        f'{span:.1f} s of data in {perf_counter() - begin:.2f} s'
     )
     for why, count in reader.lacking.items():
         print(f'{count} messages left out: {why}')
@@ -164,12 +152,17 @@ def _replay(arguments: argparse.Namespace, stop: Stop) -> None:
         later = 'and after' if arguments.smooth else f'and until {lag:g} s after'
         print(f'smoothed: each estimate by the samples before {later} it')
     print(f'stamps: {stamps}')
-    print(f'parameters: {_origin(arguments, recorded)}')
-    if not arguments.params_file and not recorded:
+    origin = f'{recorded.topic} in the bag' if recorded else 'the defaults'
+    if arguments.params_file:
+        origin = ', '.join(map(str, arguments.params_file))
+    elif not recorded:
         _warn(
             'the bag has no ~/parameters to take, so the defaults are used; '
             "--params-file gives the node's own"
         )
+    changed = named(arguments)
+    changes = f', with {", ".join(changed)} of the command line' if changed else ''
+    print(f'parameters: {origin}{changes}')
     if live:
         print(live.report())
     if reader.unchecked:
@@ -188,51 +181,35 @@ def _estimates(
 ) -> Iterator[Rows]:
     """Yield estimates block by block; `whole`: smoothed over the whole recording."""
     events: list[tuple[int, Event]] = []
-    lasting = 0  # 1 while an event lasts
+    active = np.zeros(len(samples.times), dtype=np.int8)  # 1 while an event lasts
 
-    def due(found: Trajectory) -> Rows:
-        """Return the rows whose smoothed estimates are final."""
-        smoothing = estimator.smoothing
-        numbers = np.zeros(0, dtype=np.int64) if smoothing is None else smoothing.numbers
-        return Rows(samples.times[numbers], samples.values[numbers], found, NONE, events)
+    def rows(numbers: NDArray[np.int64], found: Trajectory) -> Iterator[Rows]:
+        if len(numbers):
+            lasting = active[numbers] if estimator.events.on else active[:0]
+            yield Rows(samples.times[numbers], samples.values[numbers], found, lasting, events)
+            events.clear()
 
     parts = live.parts(samples.stamps) if live else [slice(0, len(samples.stamps))]
     for part in parts:
         for begin in range(part.start, part.stop, BLOCK):
-            block = slice(begin, min(begin + BLOCK, part.stop))
-            times, stamps, y = samples.part(block)
-            found = estimator.run(stamps, y, None if u is None else u[block])
-            active = lasting + np.zeros(len(times), dtype=np.int64)
+            times, stamps, y = samples.part(slice(begin, min(begin + BLOCK, part.stop)))
+            found = estimator.run(stamps, y, None if u is None else u[begin : begin + len(y)])
             for event in estimator.events.taken():
-                lasting = int(event.begins)
-                active[event.sample :] = lasting
+                active[begin + event.sample :] = event.begins
                 events.append((int(times[event.sample]), event))
-            if estimator.smoothing is not None:
-                rows = due(found)
+            if estimator.smoothing is not None:  # those that are final
+                yield from rows(estimator.smoothing.numbers, found)
             else:
                 keep = np.flatnonzero((found.status & UNUSED) == 0)
-                active = active[keep] if estimator.events.on else NONE
-                rows = Rows(times[keep], y[keep], found.rows(keep), active, events)
-            if len(rows.times):
-                yield rows
-                events = []
-    if whole and len((rows := due(estimator.finish())).times):
-        yield rows
+                yield from rows(begin + keep, found.rows(keep))
+    if whole:
+        found = estimator.finish()
+        assert estimator.smoothing is not None
+        yield from rows(estimator.smoothing.numbers, found)
 
 
 def _warn(text: str) -> None:
     print(f'replay: warning: {text}', file=sys.stderr)
-
-
-def _origin(arguments: argparse.Namespace, recorded: Recorded | None) -> str:
-    if arguments.params_file:
-        base = ', '.join(map(str, arguments.params_file))
-    elif recorded:
-        base = f'{recorded.topic} in the bag'
-    else:
-        base = 'the defaults'
-    own = named(arguments)
-    return base + (f', with {", ".join(own)} of the command line' if own else '')
 
 
 def _name(present: set[str], name: str | None) -> str:

@@ -86,11 +86,6 @@ class LiveRun:
     fixed : collection of str
         Parameters whose live changes are not repeated.
 
-    Attributes
-    ----------
-    left_out : int
-        Samples before the first one that can be followed.
-
     Raises
     ------
     UnknownSnapshot
@@ -103,14 +98,12 @@ class LiveRun:
     ) -> None:
         self._name, self._estimator = name, estimator
         self._events = _read_events(reader, name, fixed)
-        self.left_out = 0
-        self._followed = self._resumed = False
-        self._unfit = ''
-        self._same = self._other = 0
+        self._begin = ''  # how and where it began
+        self._same: list[bool] = []  # whether snapshots are
 
     def begin(self, samples: FieldSamples) -> FieldSamples:
         """Return the samples from the first one at which a snapshot tells the live state."""
-        changes: dict[str, Any] = {}
+        estimator, changes = self._estimator, dict[str, Any]()
         while self._events:
             event = self._events.pop(0)
             stamp, flags, values = event.snapshot
@@ -118,22 +111,23 @@ class LiveRun:
             found = np.flatnonzero(samples.stamps == stamp)
             if not len(found):
                 continue
-            self._followed, self.left_out = True, int(found[0])
+            first, how, unfit = int(found[0]), '', ''
             if flags & Flag.STARTED:
                 # First sample of the live estimator, or first after a restart: it may hold inputs.
                 held = np.ravel(values.get('u', ()))
-                for index, u in enumerate(held[: len(self._estimator.inputs)].tolist()):
-                    self._estimator.set_input(u, index)
+                for index, u in enumerate(held[: len(estimator.inputs)].tolist()):
+                    estimator.set_input(u, index)
                 self._events.insert(0, event._replace(changes=changes))
             else:
                 self._configure(changes)
                 try:
-                    self._estimator.load_state_dict(values)
-                    self._resumed = True
-                    self.left_out += 1  # the snapshot is what it was after this one
+                    estimator.load_state_dict(values)
+                    how = 'from the state it had'
+                    first += 1  # the snapshot is what it was after this one
                 except ConfigurationError as error:  # as of an observer of another size
-                    self._unfit = f'; its state does not fit ({error})'
-            return samples.part(slice(self.left_out, None))
+                    unfit = f'; its state does not fit ({error})'
+            self._begin = f'{how or "afresh"} after {first} samples of the bag{unfit}'
+            return samples.part(slice(first, None))
         return samples
 
     def parts(self, stamps: NDArray[np.int64]) -> Iterator[slice]:
@@ -160,44 +154,37 @@ class LiveRun:
                 estimator.reset()
             estimator.freeze(bool(np.any(values.get('frozen', False))))
             if found or estimator.latest == stamp:
-                self._compare(event.snapshot)
+                ours, theirs = (
+                    np.concatenate([np.ravel(memory.get(name, ())) for name in COMPARED])
+                    for memory in (estimator.state_dict(), values)
+                )
+                alike = estimator.latest == stamp and ours.shape == theirs.shape
+                near = {'rtol': AGREEMENT, 'atol': AGREEMENT, 'equal_nan': True}
+                self._same.append(alike and np.allclose(ours, theirs, **near))
         yield slice(position, len(stamps))
 
     def _configure(self, changes: dict[str, Any]) -> None:
-        if not changes:
-            return
         try:
-            self._estimator.configure(changes)
+            if changes:
+                self._estimator.configure(changes)
         except ConfigurationError as error:
             raise ConfigurationError(
                 f'live change of {", ".join(changes)}: {error}; -p keeps a parameter fixed, '
                 '--afresh repeats no changes'
             ) from None
 
-    def _compare(self, snapshot: Snapshot) -> None:
-        ours, theirs = (
-            np.concatenate([np.ravel(values.get(name, ())) for name in COMPARED])
-            for values in (self._estimator.state_dict(), snapshot.values)
-        )
-        same = self._estimator.latest == snapshot.stamp and ours.shape == theirs.shape
-        if same and np.allclose(ours, theirs, rtol=AGREEMENT, atol=AGREEMENT, equal_nan=True):
-            self._same += 1
-        else:
-            self._other += 1
-
     def report(self) -> str:
         """Return a line that says how far the live estimator was followed."""
-        if not self._followed:
+        if not self._begin:
             return (
                 f"{self._name} not followed: none of its snapshots' stamps is that of a sample; "
                 'began afresh at the first'
             )
-        begin = 'from the state it had' if self._resumed else 'afresh'
-        differs = ' (parameters differ, or one of the two missed samples)' if self._other else ''
+        same, count = sum(self._same), len(self._same)
+        differs = ' (parameters differ, or one of the two missed samples)' * (same < count)
         return (
-            f'followed {self._name} {begin} after {self.left_out} samples of the bag'
-            f'{self._unfit}; {self._same} of {self._same + self._other} snapshots are the same '
-            f'to {AGREEMENT:g}{differs}'
+            f'followed {self._name} {self._begin}; {same} of {count} snapshots are the same to '
+            f'{AGREEMENT:g}{differs}'
         )
 
 

@@ -2,7 +2,7 @@
 """Where replayed estimates go: a bag, a CSV or an NPZ file, block by block."""
 
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 import csv
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -12,26 +12,10 @@ from fhaosmo_ros.core.observer.observer import Observer
 from fhaosmo_ros.core.online.events import described, Event
 from fhaosmo_ros.core.parameters.files import dumps
 from fhaosmo_ros.core.parameters.units import derivative_unit
+from fhaosmo_ros.tools.bags import types
 from fhaosmo_ros.tools.bags.reader import BagReader
-from fhaosmo_ros.tools.bags.types import (
-    diagnostics,
-    labelled_array,
-    LATCHED_QOS,
-    serialise,
-    with_numbers,
-)
 from fhaosmo_ros.tools.bags.writer import BagWriter
-from fhaosmo_ros.topics import (
-    ARRAY,
-    DIAGNOSTICS,
-    estimates_of,
-    EVENT,
-    FLOAT,
-    PARAMETERS,
-    STANDARD_DEVIATION,
-    TEXT,
-    TIME,
-)
+from fhaosmo_ros.topics import ARRAY, DIAGNOSTICS, estimates_of, EVENT, PARAMETERS, TEXT, TIME
 import numpy as np
 from numpy.typing import NDArray
 
@@ -42,12 +26,17 @@ class Rows(NamedTuple):
     times: NDArray[np.int64]  # (K,) stamps of the samples in the bag, in nanoseconds
     y: NDArray[np.float64]  # (K,)
     estimates: Trajectory  # `t` holds the stamps that dt came from, in nanoseconds
-    active: NDArray[np.int64]  # (K,) 1 while an event lasts; empty where none are asked for
+    active: NDArray[np.int8]  # (K,) 1 while an event lasts; empty where none are asked for
     events: list[tuple[int, Event]]  # those that begin or end, with their stamps in the bag
 
 
 Sink = Callable[[Rows], None]
 """Takes estimates block by block."""
+
+
+def sink(path: Path, *of_bag: Any) -> AbstractContextManager[Sink]:
+    """Open a file or a bag by its suffix; `of_bag` is what follows the path in `bag_sink`."""
+    return TABLES[path.suffix](path) if path.suffix in TABLES else bag_sink(path, *of_bag)
 
 
 def columns(rows: Rows) -> dict[str, NDArray]:
@@ -62,7 +51,7 @@ def columns(rows: Rows) -> dict[str, NDArray]:
         result |= {f'std_{name}': e.standard_deviation[:, i] for i, name in enumerate(names)}
         result |= {f'tuning_{name}': e.tuning[:, i] for i, name in enumerate(TUNING)}
     if len(rows.active):
-        result['event'] = rows.active
+        result['event'] = rows.active.astype(np.int64)
     return result | {'status': e.status, 'open_levels': e.open_levels}
 
 
@@ -116,44 +105,46 @@ def bag_sink(
         Parameters of the estimates; written once, as the node publishes them.
 
     """
-    text, has_parameters = serialise(TEXT, data=dumps(parameters, name)), False
+    text: bytes | None = types.serialise(TEXT, data=dumps(parameters, name))
     unit = derivative_unit(parameters.get('measurement_unit', ''), observer.order)
     state = [f'z{i + 1}' for i in range(observer.order)]
     labels = {
         'state': state, 'innovation': [f'eps{i + 1}' for i in range(observer.levels)],
-        STANDARD_DEVIATION: [*state, 'd'], 'tuning': TUNING,
+        'standard_deviation': [*state, 'd'], 'tuning': TUNING,
     }  # fmt: skip
-    empty = {
-        FLOAT: serialise(FLOAT, data=0.0), TIME: serialise(TIME, sec=0, nanosec=0),
-        **{of: labelled_array(names, np.zeros(len(names))) for of, names in labels.items()},
-    }  # fmt: skip
+    empty = {}
     with BagWriter(path) as bag:
-        bag.add(f'{name}/{PARAMETERS}', TEXT, qos=[LATCHED_QOS])
-        topics = estimates_of(parameters)
-        for topic, kind in topics.items():
+        bag.add(f'{name}/{PARAMETERS}', TEXT, qos=[types.LATCHED_QOS])
+        for topic, kind in estimates_of(parameters).items():
             bag.add(f'{name}/{topic}', kind)
+            if kind == ARRAY:
+                empty[topic] = types.labelled_array(labels[topic], np.zeros(len(labels[topic])))
+            else:
+                fields = {'sec': 0, 'nanosec': 0} if kind == TIME else {'data': 0.0}
+                empty[topic] = types.serialise(kind, **fields)
         bag.copy(reader)
 
         def write(rows: Rows) -> None:
-            nonlocal has_parameters
-            if not has_parameters:
+            nonlocal text
+            if text:
                 bag.write(f'{name}/{PARAMETERS}', int(rows.times[0]), text)
-                has_parameters = True
+                text = None
             e = rows.estimates
             found = {
-                'gamma': e.gamma, STANDARD_DEVIATION: e.standard_deviation, 'tuning': e.tuning,
+                'gamma': e.gamma, 'standard_deviation': e.standard_deviation, 'tuning': e.tuning,
                 'state': e.z, 'unknown_input': e.unknown_input, 'innovation': e.innovation,
                 'stamp': np.column_stack(np.divmod(e.t, 1_000_000_000)).astype('<i4'),
             }  # fmt: skip
-            columns = []
-            for topic, kind in topics.items():
-                message = empty[topic if kind == ARRAY else kind]
-                columns.append((f'{name}/{topic}', with_numbers(message, found[topic])))
-            bag.write_columns(rows.times, columns)
+            bag.write_columns(rows.times, {
+                f'{name}/{topic}': types.with_numbers(message, found[topic])
+                for topic, message in empty.items()
+            })  # fmt: skip
             for time, event in rows.events:
-                bag.add(f'{name}/{EVENT}', DIAGNOSTICS, qos=[LATCHED_QOS])
+                bag.add(f'{name}/{EVENT}', DIAGNOSTICS, qos=[types.LATCHED_QOS])
                 status = f'{name.lstrip("/")}: event'
-                message = diagnostics(event.stamp, event.begins, status, *described(event, unit))
+                message = types.diagnostics(
+                    event.stamp, event.begins, status, *described(event, unit)
+                )
                 bag.write(f'{name}/{EVENT}', time, message)
 
         yield write
