@@ -25,6 +25,7 @@ from fhaosmo_ros.core.parameters.tables import (
     PLANT_NODE_PARAMETERS,
     PLANT_PARAMETERS,
 )
+from fhaosmo_ros.core.simulation.metrics import rms
 from fhaosmo_ros.core.simulation.plant import quantised, respond
 import numpy as np
 from numpy.random import Generator
@@ -195,63 +196,41 @@ class Family:
         grid = np.arange(count) / p['sample_rate']
         moments = _increasing(grid + p['period_jitter'] * random.standard_normal(count))
         stamps = _increasing(moments + p['stamp_jitter'] * random.standard_normal(count))
-        if p['dropout'] > 0.0:
-            kept = _kept(count, p['dropout'], p['dropout_length'], random)
+        if p['dropout'] > 0.0:  # runs of samples, geometric in length; the first sample stays
+            begin = p['dropout'] / (p['dropout_length'] * (1.0 - p['dropout']))
+            end = 1.0 / p['dropout_length']
+            kept = [True]
+            for draw in random.uniform(size=count)[1:]:
+                kept.append(draw >= (begin if kept[-1] else 1.0 - end))
             moments, stamps = moments[kept], stamps[kept]
         return moments, stamps
 
     def _wave(self, shape: str, t: Floats, random: Generator) -> Floats:
         """Return a random signal of unit RMS."""
-        p = self.parameters
-        low, high = p['band_of_d']
-        if shape == 'sines':
-            return _sines(t, low, high, random)
-        if shape == 'chirp':
-            return _chirp(t, low, high, random)
-        return _steps(t, p['step_interval'], random)
-
-
-def _sines(t: Floats, low: float, high: float, random: Generator) -> Floats:
-    """One sine in each of `SINES` parts of the band, so that none is left out."""
-    share = (np.arange(SINES) + random.uniform(size=SINES)) / SINES
-    omega = low * (high / low) ** share
-    amplitude = random.uniform(0.5, 1.5, SINES)
-    amplitude *= np.sqrt(2.0 / np.sum(amplitude**2))
-    phase = random.uniform(0.0, 2.0 * np.pi, SINES)
-    wave = np.zeros_like(t)
-    for a, w, start in zip(amplitude, omega, phase, strict=True):
-        wave += a * np.sin(w * t + start)
-    return wave
-
-
-def _chirp(t: Floats, low: float, high: float, random: Generator) -> Floats:
-    """Angular frequency from one end of the band to the other, exponentially."""
-    first, last = (low, high) if random.uniform() < 0.5 else (high, low)
-    rate = np.log(last / first) / t[-1]
-    angle = first / rate * np.expm1(rate * t)
-    return np.asarray(np.sqrt(2.0) * np.sin(angle + random.uniform(0.0, 2.0 * np.pi)))
-
-
-def _steps(t: Floats, interval: float, random: Generator) -> Floats:
-    levels = max(2, int(np.ceil(3.0 * t[-1] / interval)) + 1)
-    waits = interval * (1.0 / 3.0 + random.exponential(2.0 / 3.0, levels))
-    number = np.searchsorted(np.cumsum(waits), t, side='right')
-    wave = random.standard_normal(levels + 1)[number]
-    size = np.sqrt(np.mean(wave**2))
-    return np.asarray(wave / size)
+        low, high = self.parameters['band_of_d']
+        if shape == 'sines':  # one in each of `SINES` parts of the band, so that none is left out
+            share = (np.arange(SINES) + random.uniform(size=SINES)) / SINES
+            amplitude = random.uniform(0.5, 1.5, SINES)
+            amplitude *= np.sqrt(2.0 / np.sum(amplitude**2))
+            phase = random.uniform(0.0, 2.0 * np.pi, SINES)
+            rows = zip(amplitude, low * (high / low) ** share, phase, strict=True)
+            wave = np.zeros_like(t)
+            for a, omega, start in rows:
+                wave += a * np.sin(omega * t + start)
+            return wave
+        if shape == 'chirp':  # from one end of the band to the other, exponentially
+            first, last = (low, high) if random.uniform() < 0.5 else (high, low)
+            rate = np.log(last / first) / t[-1]
+            angle = first / rate * np.expm1(rate * t)
+            return np.asarray(np.sqrt(2.0) * np.sin(angle + random.uniform(0.0, 2.0 * np.pi)))
+        interval = self.parameters['step_interval']
+        levels = max(2, int(np.ceil(3.0 * t[-1] / interval)) + 1)
+        waits = interval * (1.0 / 3.0 + random.exponential(2.0 / 3.0, levels))
+        wave = random.standard_normal(levels + 1)[np.searchsorted(np.cumsum(waits), t, 'right')]
+        return np.asarray(wave / rms(wave))
 
 
 def _increasing(t: Floats) -> Floats:
     t = np.maximum(np.sort(t), 0.0)
     rank = np.arange(len(t)) * SHORTEST
     return np.asarray(np.maximum.accumulate(t - rank) + rank)
-
-
-def _kept(count: int, share: float, length: float, random: Generator) -> NDArray[np.bool_]:
-    """Lose runs of samples, geometric in length; the first sample stays."""
-    begin = share / (length * (1.0 - share))
-    draws = random.uniform(size=count)
-    kept = np.ones(count, dtype=bool)
-    for k in range(1, count):
-        kept[k] = draws[k] >= (begin if kept[k - 1] else 1.0 - 1.0 / length)
-    return kept

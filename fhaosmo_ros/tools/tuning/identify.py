@@ -13,15 +13,10 @@ from fhaosmo_ros.core.online.policy import GAP_SAMPLES
 from fhaosmo_ros.core.parameters.declaration import Parameters
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS, OBSERVER_PARAMETERS
+from fhaosmo_ros.core.simulation.metrics import rms
 from fhaosmo_ros.tools.cli.command import progress
 from fhaosmo_ros.tools.tuning.likelihood import CLIP, Design, Evaluation, Likelihood, Samples
-from fhaosmo_ros.tools.tuning.linear_gains import (
-    GAMMA,
-    kalman_gains,
-    rounded,
-    SCHEME,
-    WIDTH,
-)
+from fhaosmo_ros.tools.tuning.linear_gains import GAMMA, kalman_gains, rounded, SCHEME, WIDTH
 from fhaosmo_ros.tools.tuning.objective import stamps_of
 import numpy as np
 from numpy.typing import NDArray
@@ -96,14 +91,9 @@ class Run(NamedTuple):
 
     unknown_input: Floats  # (K,)
     size: float  # RMS innovation over the expected one, without the largest hundredth
-    correlations: Floats  # (LAGS,) autocorrelations of the innovations
+    correlation: float  # the largest autocorrelation of the innovations, within `LAGS` samples
     probability: float  # of so large ones, were innovations white (Ljung and Box 1978)
     counters: Counters
-
-    @property
-    def lag(self) -> int:
-        """Index of the largest of `correlations`."""
-        return int(np.abs(self.correlations).argmax())
 
 
 def identify_input(
@@ -238,18 +228,16 @@ def run(found: Identified, gains: Gains) -> Run:
     r = trajectory.innovation[:, 0] / (gains.share * gains.innovation)
     r = r[np.isfinite(r) & samples.used & (np.arange(len(r)) >= begin)]
     usual = r[np.abs(r) <= np.quantile(np.abs(r), 0.99)]
-    size = float(np.sqrt(np.mean(usual**2))) / SIZE_OF_USUAL
-    return Run(trajectory.unknown_input, size, *_whiteness(r), estimator.counters)
-
-
-def _whiteness(r: Floats) -> tuple[Floats, float]:
-    """Return autocorrelations, and their probability for white noise (Ljung and Box 1978)."""
+    size = rms(usual) / SIZE_OF_USUAL
+    # Whether they are white (Ljung and Box 1978).
     r = np.clip(r, -CLIP, CLIP)
     r = r - r.mean()
-    count, power, lags = len(r), float(r @ r), range(1, LAGS + 1)
-    found = np.array([r[:-j] @ r[j:] / power for j in lags])
-    statistic = count * (count + 2.0) * np.sum(found**2 / (count - np.array(lags)))
-    return found, float(chi2.sf(statistic, LAGS))
+    count, lags = len(r), np.arange(1, LAGS + 1)
+    correlations = np.array([r[:-j] @ r[j:] for j in lags]) / (r @ r)
+    statistic = count * (count + 2.0) * np.sum(correlations**2 / (count - lags))
+    largest, probability = correlations[np.abs(correlations).argmax()], chi2.sf(statistic, LAGS)
+    d = trajectory.unknown_input
+    return Run(d, size, float(largest), float(probability), estimator.counters)
 
 
 def _prepared(
@@ -269,14 +257,14 @@ def _prepared(
     h = np.diff(t, prepend=t[0])
     period = float(np.median(h[1:]))
     periods = np.maximum(np.round(h / period), 1.0).astype(np.int64)
-    periods[(h > max(values['max_gap'] or GAP_SAMPLES * period, 3.0 * period))] = periods[0] = 0
+    periods[h > max(values['max_gap'] or GAP_SAMPLES * period, 3.0 * period)] = periods[0] = 0
     samples = Samples(h, periods, y, np.ascontiguousarray(u), np.ones(count, dtype=bool))
     block = max(count // 300, 1)
     slow = y[: count // block * block].reshape(-1, block).mean(axis=1)
-    sizes = [float(np.sqrt(np.mean(slow**2)))]
+    sizes = [rms(slow)]
     for _ in range(1, model.order):
         slow = np.diff(slow) / (block * period)
-        sizes.append(3.0 * float(np.sqrt(np.mean(slow**2))))
+        sizes.append(3.0 * rms(slow))
     rounding = quantum(y) / math.sqrt(12.0)
     # A smooth signal vanishes in differences of high order.
     rough = median_abs_deviation(np.diff(y, 4), scale='normal') / math.sqrt(70.0)
@@ -345,14 +333,11 @@ def _fit(evaluate: Evaluate, design: Design, period: float, decay: float | None)
         ratio = decay / bandwidth if decay else math.exp(point[1])
         return evaluate(design._replace(bandwidth=bandwidth, ratio=ratio))
 
-    def loss(point: Floats) -> float:
-        value = at(point).log_likelihood
-        return -value if math.isfinite(value) else 1e300
-
     count = 1 if decay else 2
     start = np.log([design.bandwidth * period, design.ratio])[:count]
     found = minimize(
-        loss, start, method='Nelder-Mead', bounds=BOUNDS[:count],
+        lambda point: min(-at(point).log_likelihood, 1e300), start, method='Nelder-Mead',
+        bounds=BOUNDS[:count],
         options={
             'initial_simplex': np.vstack([start, start + np.diag(STEPS[:count])]),
             'xatol': 0.02, 'fatol': 0.1, 'maxfev': EVALUATIONS,

@@ -99,23 +99,19 @@ def of_bag(found: Identified, gains: Gains, run: Run, bag: str) -> Report:
         ('derivatives of d that are followed', f'{best.design.derivatives}'),
         ('bandwidth of the filter, rad/s', f'{best.design.bandwidth:.3g}'),
     ]
-    names = [*(f'z{i + 1}' for i in range(likelihood.model.order)), 'd']
-    for name, error in zip(names, gains.expected, strict=True):
-        rows.append((f'expected error of {name}', f'{error:.3g}'))
-    chance = 2.0 / math.sqrt(len(run.unknown_input))
-    largest = f'{run.correlations[run.lag]:+.3f} over {run.lag + 1}'
+    for i, error in enumerate(gains.expected[:-1], 1):
+        rows.append((f'expected error of z{i}', f'{error:.3g}'))
+    share = gains.expected[-1] / size
+    rows.append(('expected error of d', f'{gains.expected[-1]:.3g} ({share:.2f} of its size)'))
     along = [
         ('innovations, measured / expected', f'{run.size:.2f}'),
-        ('innovations, expected', f'{gains.innovation:.3g}'),
-        (f'their largest correlation within {LAGS} samples', largest),
-        ('what chance explains of it', f'{chance:.3f}'),
+        (f'their largest correlation within {LAGS} samples', f'{run.correlation:+.3f}'),
         ('probability of that if they are white (Ljung-Box)', f'{run.probability:.2g}'),
         ('samples rejected', f'{run.counters.rejected}'),
         ('times begun afresh', f'{run.counters.divergences}'),
     ]
     main = '\n\n'.join([
         table(['found in y', ''], rows),
-        f'The error of d is expected to be {gains.expected[-1] / size:.2f} of its size.',
         table(['the estimator along the bag', ''], along),
         *told,
         'This is what y shows in this bag: where d will be quicker or larger, record it so.',
@@ -148,11 +144,10 @@ def notes(found: Identified, run: Run) -> Iterator[str]:
             'sign in phi is wrong; if one does, its command should be a known input, or d '
             'contains it.'
         )
-    correlation = run.correlations[run.lag]
-    if run.probability < UNLIKELY and abs(correlation) > SMALL_CORRELATION:
+    if run.probability < UNLIKELY and abs(run.correlation) > SMALL_CORRELATION:
         yield (
-            f'Innovations are not white: they correlate by {correlation:+.2f} with those '
-            f'{run.lag + 1} before them. The model of the plant, of d or of the noise does not '
-            'quite fit; the gains are the best of their kind, but standard deviations are too '
-            'small. `gains: self_tuning` follows noise that is coloured.'
+            f'Innovations are not white: they correlate by {run.correlation:+.2f} with earlier '
+            'ones. The model of the plant, of d or of the noise does not quite fit; the gains are '
+            'the best of their kind, but standard deviations are too small. '
+            '`gains: self_tuning` follows noise that is coloured.'
         )
