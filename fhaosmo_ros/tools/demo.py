@@ -228,32 +228,30 @@ def table(run: Run, compared: Mapping[str, Floats], marks: Sequence[tuple[int, s
 
     `marks` says when something changed (stamps in ns), and what.
     """
-    origin = run.y.stamps[run.rows[0]]
-    edges = [START, *((stamp - origin) * 1e-9 for stamp, _ in marks), np.inf]
-    parts = [
-        (begin, part) for begin, end in pairwise(edges)
-        if (part := (run.t >= begin) & (run.t < end)).any()
-    ] or [(0.0, run.t >= 0.0)]  # fmt: skip
-    d = run.curves.truth[:, -1]
+    t, d = run.t, run.curves.truth[:, -1]
+    edges = [START, *((stamp - run.curves.stamps[0]) * 1e-9 for stamp, _ in marks), np.inf]
+    parts = {begin: (t >= begin) & (t < end) for begin, end in pairwise(edges)}
+    parts = {begin: part for begin, part in parts.items() if part.any()} or {0.0: t >= 0.0}
     estimates = {'this estimator, live': run.curves.estimate[:, -1], **compared}
     width = max(map(len, estimates))
-    head = ''.join(f'{f"from {begin:.0f} s":>20}' for begin, _ in parts)
     lines = [
-        f'{"d":{width}}{head}', f'{"":{width}}' + f'{"error":>12}{"chatter":>8}' * len(parts)
-    ]  # fmt: skip
+        f'{"d":{width}}' + ''.join(f'{f"from {begin:.0f} s":>20}' for begin in parts),
+        f'{"":{width}}' + f'{"error":>12}{"chatter":>8}' * len(parts),
+    ]
     for name, estimate in estimates.items():
-        cells = (
+        lines.append(f'{name:{width}}' + ''.join(
             f' {rms((estimate - d)[part]):11.2g} {chatter(estimate[part], d[part]):7.3g}'
-            for _, part in parts
-        )
-        lines.append(f'{name:{width}}' + ''.join(cells))
-    sizes = ''.join(f'{rms(d[part]):12.2g}{"":8}' for _, part in parts)
+            for part in parts.values()
+        ))  # fmt: skip
+    sizes = ''.join(f'{rms(d[part]):12.2g}{"":8}' for part in parts.values())
     lines.append(f'{"RMS of d itself":{width}}{sizes}'.rstrip())
     if compared:
         lines.append(WORDS.rstrip())
-    late = run.errors[run.t >= parts[0][0]]
+    begin = min(parts)
+    late = run.errors[t >= begin]
     errors = [f'{name} {rms(late[:, k]):.2g}' for k, name in enumerate(run.curves.names[:-1])]
-    lines += ['', f'RMS errors of the states from {parts[0][0]:.0f} s on: {", ".join(errors)}']
     rate = 1e9 / np.mean(np.diff(run.y.stamps))
-    lines.append(f'samples: {len(run.y.stamps)}, {rate:.1f} a second')
-    return '\n'.join(lines)
+    return '\n'.join([
+        *lines, '', f'RMS errors of the states from {begin:.0f} s on: {", ".join(errors)}',
+        f'samples: {len(run.y.stamps)}, {rate:.1f} a second',
+    ])  # fmt: skip

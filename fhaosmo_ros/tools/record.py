@@ -8,7 +8,6 @@ import re
 import shutil
 import sys
 import time
-from typing import Any
 
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.stop_signals import Stop
@@ -56,11 +55,20 @@ def _record(arguments: argparse.Namespace, stop: Stop) -> None:
         arguments.all,
         arguments.ros_arguments,
     )
+    bar_format = '{desc}: {n_fmt} messages, {elapsed}'
     try:
         with bag, recorder:
             # Says when it listens, so that a user knows when to start what is to be recorded.
             print(f'recording to {path}; Ctrl-C ends it', flush=True)
-            _watch(recorder, arguments.duration, stop)
+            end = time.monotonic() + (arguments.duration or math.inf)
+            with progress(desc='record', unit='message', bar_format=bar_format) as bar:
+                ended = False
+                while not ended:
+                    ended = stop.wait(0.05) or time.monotonic() >= end
+                    recorder.check()
+                    while recorder.problems:
+                        bar.write(f'record: {recorder.problems.pop(0)}', file=sys.stderr)
+                    bar.update(recorder.counts.total() - bar.n)
     except OSError as error:
         hint = '; `mcap recover` saves what was recorded' if path.exists() else ''
         raise ConfigurationError(
@@ -77,16 +85,3 @@ def _record(arguments: argparse.Namespace, stop: Stop) -> None:
             file=sys.stderr,
         )
     print(f'{recorder.counts.total()} messages: {path}')
-
-
-def _watch(recorder: Any, duration: float | None, stop: Stop) -> None:
-    """Show how many messages have come until the user or the time ends it."""
-    end, ended = math.inf if duration is None else time.monotonic() + duration, False
-    bar_format = '{desc}: {n_fmt} messages, {elapsed}'
-    with progress(desc='record', unit='message', bar_format=bar_format) as bar:
-        while not ended:
-            ended = stop.wait(0.05) or time.monotonic() >= end
-            recorder.check()
-            while recorder.problems:
-                bar.write(f'record: {recorder.problems.pop(0)}', file=sys.stderr)
-            bar.update(recorder.counts.total() - bar.n)

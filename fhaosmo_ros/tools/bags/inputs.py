@@ -13,8 +13,6 @@ from fhaosmo_ros.tools.bags.reader import BagReader, FieldSamples
 import numpy as np
 from numpy.typing import NDArray
 
-Arrival = tuple[int, int, int, float]
-"""Time in the bag, number of the input or `SAMPLE`, stamp, and value."""
 SAMPLE = 1000
 """A sample comes after the inputs that have its time."""
 
@@ -94,8 +92,7 @@ class BagInputs:
         bag has no such topic or field.
         """
         names, count = self._model.inputs, len(self._model.inputs)
-        before = list(held or [0.0] * count)
-        pairing = Pairing(self._values, names, self._u, before)
+        pairing = Pairing(self._values, names, self._u, list(held or [0.0] * count))
         arrivals = [_arrivals(samples, SAMPLE)]
         for name, its in self._u.items():
             field = self._reader.field(its.topic, its.field, its.name)
@@ -117,6 +114,7 @@ class BagInputs:
         return np.fromiter(paired(), np.dtype((np.float64, count)), len(samples.times))
 
 
-def _arrivals(samples: FieldSamples, number: int) -> Iterator[Arrival]:
+def _arrivals(samples: FieldSamples, number: int) -> Iterator[tuple[int, int, int, float]]:
+    """Yield time in the bag, number of the input or `SAMPLE`, stamp, and value."""
     for time, stamp, value in zip(*(column.tolist() for column in samples), strict=True):
         yield time, number, stamp, value

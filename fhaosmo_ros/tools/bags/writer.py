@@ -8,6 +8,7 @@ rosbag2 names a storage file, so that `ros2 bag reindex` finds it.
 """
 
 from collections.abc import Mapping, Sequence
+from copy import deepcopy
 import os
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -80,9 +81,7 @@ class BagWriter:
         digest: str = '',
     ) -> bool:
         """Add a topic if the bag lacks it; return False if its type has no definition here."""
-        if types is TYPES:
-            learn(message_type)
-        known = message_type in types.fielddefs
+        known = message_type in types.fielddefs or (types is TYPES and learn(message_type))
         if topic in self._channels:
             return known
         if not known:
@@ -209,23 +208,20 @@ class BagWriter:
 
     def _information(self) -> dict[str, Any]:
         """Return what metadata.yaml says of the bag."""
-        name = Path(self._file.name).name
-        counts = self._statistics.channel_message_counts
+        s, name = self._statistics, Path(self._file.name).name
+        counts = s.channel_message_counts
+        span = {
+            'starting_time': {'nanoseconds_since_epoch': s.message_start_time},
+            'duration': {'nanoseconds': s.message_end_time - s.message_start_time},
+            'message_count': s.message_count,
+        }
         return {
-            'version': 9, 'storage_identifier': 'mcap', **self._span(),
+            'version': 9, 'storage_identifier': 'mcap', **span,
             'topics_with_message_count': [
                 {'topic_metadata': topic, 'message_count': counts.get(channel, 0)}
                 for topic, channel in zip(self._topics, self._channels.values(), strict=True)
             ],
             'compression_format': '', 'compression_mode': '', 'relative_file_paths': [name],
-            'files': [{'path': name, **self._span()}], 'custom_data': None,
+            'files': [{'path': name, **deepcopy(span)}], 'custom_data': None,
             'ros_distro': os.environ.get('ROS_DISTRO') or 'jazzy',
         }  # fmt: skip
-
-    def _span(self) -> dict[str, Any]:
-        s = self._statistics
-        return {
-            'starting_time': {'nanoseconds_since_epoch': s.message_start_time},
-            'duration': {'nanoseconds': s.message_end_time - s.message_start_time},
-            'message_count': s.message_count,
-        }
