@@ -43,9 +43,8 @@ class Curves(NamedTuple):
 
     def part(self, rows: NDArray[np.bool_]) -> 'Curves':
         """Return some of the rows."""
-        columns = ('stamps', 'estimate', 'innovation', 'gamma', 'deviation', 'truth')
-        found = {name: getattr(self, name) for name in columns}
-        return self._replace(**{k: None if x is None else x[rows] for k, x in found.items()})
+        arrays = {k: x for k, x in self._asdict().items() if isinstance(x, np.ndarray)}
+        return self._replace(**{name: array[rows] for name, array in arrays.items()})
 
 
 def read_curves(path: Path, names: list[str] | None, plant: str) -> list[Curves]:
@@ -62,8 +61,7 @@ def read_curves(path: Path, names: list[str] | None, plant: str) -> list[Curves]
         topics = {c.topic for c in reader.connections if c.msgcount}
         candidates = sorted({topic.rpartition('/')[0] for topic in topics})
         found = [n for n in candidates if topics.issuperset(f'{n}/{part}' for part in ESTIMATES)]
-        wrong = [name for name in names or [] if name not in found]
-        if wrong:
+        if wrong := [name for name in names or [] if name not in found]:
             raise ConfigurationError(
                 f'bag {path}: expected estimates of one of {", ".join(found) or "none"}, '
                 f'got {wrong[0]!r}'

@@ -76,12 +76,8 @@ def save_curves(
     axes = dict(zip(rows, figure.subplots(len(rows), 1, sharex=True), strict=True))
     origin = min(c.stamps[0] for c in curves)
     for number, c in enumerate(curves):
-        style = {
-            'color': COLOURS[number % len(COLOURS)],
-            'linestyle': DASHES[number % len(DASHES)],
-            'linewidth': 1.2,
-            'label': c.label,
-        }
+        colour, dashes = COLOURS[number % len(COLOURS)], DASHES[number % len(DASHES)]
+        style = {'color': colour, 'linestyle': dashes, 'linewidth': 1.2, 'label': c.label}
         t = (c.stamps - origin) * 1e-9
         for k, name in enumerate(c.names):
             row = axes[name if name == 'd' else names[k]]
@@ -89,16 +85,21 @@ def save_curves(
                 row.plot(*envelope(t, c.truth[:, k]), **TRUTH)
             row.plot(*envelope(t, c.estimate[:, k]), **style)
             if c.deviation is not None:
-                draw_band(row, t, c.estimate[:, k], c.deviation[:, k], style['color'])
+                draw_band(row, t, c.estimate[:, k], c.deviation[:, k], colour)
         for begin, end in (np.array(c.events).reshape(-1, 2) - origin) * 1e-9:
-            axes['d'].axvspan(begin, end, color=style['color'], alpha=0.12, linewidth=0.0)
+            axes['d'].axvspan(begin, end, color=colour, alpha=0.12, linewidth=0.0)
         if c.gamma is not None:
             axes['gamma'].plot(*envelope(t, c.gamma), **style)
             axes['gamma'].set_ylabel('power γ')
     for name in names:
         those = [c for c in curves if name in c.names]
-        _fit_after_transient(axes[name], [c.estimate[:, c.names.index(name)] for c in those])
         axes[name].set_ylabel(those[0].title(name))
+        # What comes after the first tenth fills the picture.
+        late = [c.estimate[len(c.stamps) // 10 :, c.names.index(name)] for c in those]
+        known = np.concatenate(late)[np.isfinite(np.concatenate(late))]
+        if len(known):
+            margin = 0.1 * float(np.ptp(known)) or 0.1 * abs(float(known[0])) or 1.0
+            axes[name].set_ylim(known.min() - margin, known.max() + margin)
     t = (first.stamps - origin) * 1e-9
     _draw_innovations(axes['innovation'], t, first.innovation, first.epsilon)
     axes['innovation'].set_ylabel('|innovation|' + ('\n(first)' if len(curves) > 1 else ''))
@@ -111,12 +112,11 @@ def save_curves(
         row.set_ylim(-size, size)  # what is beyond leaves the picture
         row.set_ylabel('error of d')
         row.legend(loc='upper right', ncols=len(errors), fontsize='x-small')
-    for stamp, words in marks:
-        for row in axes.values():
-            row.axvline((stamp - origin) * 1e-9, color='black', linewidth=0.8, linestyle=':')
-        axes['d'].set_title(words, fontsize='small', loc='right')
     for row in axes.values():
         row.grid(alpha=0.3)
+        for stamp, _ in marks:
+            row.axvline((stamp - origin) * 1e-9, color='black', linewidth=0.8, linestyle=':')
+    axes['d'].set_title(', '.join(words for _, words in marks), fontsize='small', loc='right')
     axes[rows[-1]].set_xlabel('time since the first estimate [s]')
     handles, labels = axes[rows[0]].get_legend_handles_labels()
     figure.legend(handles, labels, loc='outside upper center', ncols=2, fontsize='small')
@@ -158,12 +158,3 @@ def _draw_innovations(
         axes.set_ylim(low, max(high, 3.0 * epsilon))
         axes.axhspan(low, epsilon, color='grey', alpha=0.15, label='band ε')
     axes.legend(loc='upper right', ncols=5, fontsize='small')
-
-
-def _fit_after_transient(axes: Axes, rows: list[NDArray[np.float64]]) -> None:
-    """Fit the picture to what comes after the first tenth."""
-    late = np.concatenate([row[len(row) // 10 :] for row in rows])
-    late = late[np.isfinite(late)]
-    if len(late):
-        margin = 0.1 * float(np.ptp(late)) or 0.1 * abs(float(late[0])) or 1.0
-        axes.set_ylim(late.min() - margin, late.max() + margin)

@@ -120,10 +120,9 @@ def identify_input(
 
     """
     likelihood = _prepared(recorded, model, values, given)
-    decay = given.get('unknown_input_decay') or None
-    first, *others = DERIVATIVES
+    decay, tried = given.get('unknown_input_decay') or None, DERIVATIVES
     if 'unknown_input_derivatives' in given:
-        first, others = given['unknown_input_derivatives'], []
+        tried = (given['unknown_input_derivatives'],)
     with progress(unit='filter', desc='likelihood', leave=False) as bar:
 
         def evaluate(design: Design) -> Evaluation:
@@ -132,10 +131,9 @@ def identify_input(
 
         start = _start(likelihood, evaluate)
         outliers = _leave_out_outliers(likelihood, start)
-        best = _fit(evaluate, start.design._replace(derivatives=first), likelihood.period, decay)
-        for k in others:
-            design = start.design._replace(derivatives=k)
-            richer = _fit(evaluate, design, likelihood.period, decay)
+        designs = [start.design._replace(derivatives=k) for k in tried]
+        best, *others = [_fit(evaluate, d, likelihood.period, decay) for d in designs]
+        for richer in others:
             if richer.log_likelihood > best.log_likelihood + WORTH:
                 best = richer
         still = STILL / float(likelihood.samples.h.sum())
@@ -155,18 +153,13 @@ def _refuse(found: Identified, fall: float) -> None:
             f'{list(likelihood.model.phi)} follows: its estimates leave the finite numbers'
         )
     silent = noise < NO_NOISE * float(np.std(y)) and not found.quantum
-    if silent and not likelihood.fixed:
+    if (silent or bandwidth > 0.9 * QUICKEST / period) and not likelihood.fixed:
         raise ConfigurationError(
-            f'y: expected noise, got none that shows ({noise:.1e} in a y of '
-            f'{np.std(y):.3g}), as in a simulation without noise: the less noise, the larger the '
-            'gains, without limit. Say what the sensor will have: -p noise_size:=...'
-        )
-    if bandwidth > 0.9 * QUICKEST / period and not likelihood.fixed:
-        raise ConfigurationError(
-            f'y: the likeliest filter follows every sample ({bandwidth:.3g} rad/s at '
-            f'{1.0 / period:.4g} Hz). Either y has no noise that shows, or it moves in a way that '
-            'the model cannot: it jumps, or order or phi are wrong. Say what noise the sensor '
-            'has (-p noise_size:=...), sample faster, or correct the model'
+            f'y: expected noise, got none that shows ({noise:.1e} in a y of {np.std(y):.3g}; the '
+            f'likeliest filter has {bandwidth:.3g} rad/s at {1.0 / period:.4g} Hz). The '
+            'less noise, the larger the gains, without limit: say what the sensor will have (-p '
+            'noise_size:=...). Or y moves in a way that the model cannot: it jumps, or order or '
+            'phi are wrong; then correct the model, or sample faster'
         )
     if fall < SURE:
         raise ConfigurationError(

@@ -127,10 +127,9 @@ class Objective:
         found = estimator.run(stamps_of(r.t - r.t[0]), r.y, u)
         t = r.t[0] + (found.t - FIRST_STAMP) * 1e-9  # before the sample's, if that is delayed
         late = t - r.t[0] >= self._tuning['settled']
-        t, d = t[late], found.unknown_input[late]
-        truth = np.column_stack([np.interp(t, r.t, x) for x in (*r.z.T, r.d)])
+        truth = np.column_stack([np.interp(t[late], r.t, x) for x in (*r.z.T, r.d)])
         with np.errstate(over='ignore', invalid='ignore'):
-            errors = _rms(np.column_stack([found.z[late], d]) - truth)
+            errors = _rms(np.column_stack([found.z, found.unknown_input])[late] - truth)
         # An estimate that is not finite is infinitely wrong, not undefined.
         return np.nan_to_num(errors, nan=np.inf)
 
