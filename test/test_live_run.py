@@ -198,11 +198,11 @@ def test_changes_of_one_channel_are_its_own(tmp_path, capsys):
 
 
 @pytest.mark.parametrize('labels', [['a', 'b'], ['version', 'z_hat1'], ['flags', 'm1']])
-def test_snapshot_of_another_version_is_said_and_not_followed(labels, tmp_path, capsys):
+def test_snapshot_of_another_version_is_refused(labels, tmp_path, capsys):
     data = labelled_array(labels, np.array([3.0, 1.0]))
     snapshot = '/e/snapshot', ARRAY, int(STAMPS[49]), data
     bag = files.write(tmp_path / 'bag', [*files.floats(STAMPS[:50], Y[:50]), snapshot])
-    text, found = run(capsys, bag)
-    assert text.count("'/e/snapshot'") == 1
-    assert 'begins at the first sample' in text
-    assert list(found) == STAMPS[:50].tolist()
+    said = run(capsys, bag, code=2)
+    assert "topic '/e/snapshot'" in said
+    assert '--afresh does without it' in said
+    assert list(run(capsys, bag, '--afresh')[1]) == STAMPS[:50].tolist()

@@ -23,7 +23,7 @@ from fhaosmo_ros.tools.bags.table import bag_of_table
 from fhaosmo_ros.tools.bags.topics import recorded_parameters
 from fhaosmo_ros.tools.cli.command import Output, run_command
 from fhaosmo_ros.tools.cli.options import add_parameter_options, channel_parameters, named
-from fhaosmo_ros.tools.replay.live_run import find_estimator, LiveRun, UnknownSnapshot
+from fhaosmo_ros.tools.replay.live_run import find_estimator, LiveRun
 from fhaosmo_ros.tools.replay.sinks import Rows, sink, TABLES
 from fhaosmo_ros.topics import ESTIMATES
 import numpy as np
@@ -105,10 +105,7 @@ def _replay(arguments: argparse.Namespace, stop: Stop) -> None:
         if arguments.smooth:
             estimator.smooth()
         if followed is not None:
-            try:
-                live = LiveRun(reader, followed, estimator, named(arguments))
-            except UnknownSnapshot as error:
-                _warn(f'{error}; {followed} is not followed, this begins at the first sample')
+            live = LiveRun(reader, followed, estimator, named(arguments))
         namespace = recorded.namespace if recorded else arguments.node.rpartition('/')[0]
         values, model = CHANNEL_PARAMETERS.defaults() | own, estimator.observer.model
         inputs = BagInputs(reader, values, model, namespace, arguments.channel)
@@ -156,10 +153,10 @@ def _replay(arguments: argparse.Namespace, stop: Stop) -> None:
     if arguments.params_file:
         origin = ', '.join(map(str, arguments.params_file))
     elif not recorded:
-        _warn(
-            'the bag has no ~/parameters to take, so the defaults are used; '
-            "--params-file gives the node's own"
-        )
+        print(
+            'replay: warning: the bag has no ~/parameters to take, so the defaults are used; '
+            "--params-file gives the node's own", file=sys.stderr,
+        )  # fmt: skip
     changed = named(arguments)
     changes = f', with {", ".join(changed)} of the command line' if changed else ''
     print(f'parameters: {origin}{changes}')
@@ -206,10 +203,6 @@ def _estimates(
         found = estimator.finish()
         assert estimator.smoothing is not None
         yield from rows(estimator.smoothing.numbers, found)
-
-
-def _warn(text: str) -> None:
-    print(f'replay: warning: {text}', file=sys.stderr)
 
 
 def _name(present: set[str], name: str | None) -> str:

@@ -36,10 +36,6 @@ class Event(NamedTuple):
     changes: dict[str, Any]
 
 
-class UnknownSnapshot(ConfigurationError):
-    """The bag has snapshots that this version can not read."""
-
-
 def find_estimator(reader: BagReader, name: str | None, channel: str = '') -> str | None:
     """
     Return the name of the estimator to follow: the one given, or the only one in the bag.
@@ -88,7 +84,7 @@ class LiveRun:
 
     Raises
     ------
-    UnknownSnapshot
+    ConfigurationError
         A snapshot is of another version, or damaged.
 
     """
@@ -216,7 +212,9 @@ def _read_events(reader: BagReader, name: str, fixed: Collection[str]) -> list[E
         try:
             snapshot = unpack(message.data, message.layout.dim[0].label.split(','))
         except (IndexError, ConfigurationError) as error:
-            raise UnknownSnapshot(f'topic {topic!r}: {error}') from None
+            raise ConfigurationError(
+                f'topic {topic!r}: {error}; --afresh does without it'
+            ) from None
         # The node publishes the change first, then the snapshot.
         took_them = not events or snapshot.flags & (Flag.CHANGED | Flag.STARTED)
         events.append(Event(snapshot, changes if took_them else {}))
