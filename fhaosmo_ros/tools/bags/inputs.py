@@ -34,7 +34,7 @@ class BagInputs:
     Attributes
     ----------
     y : Input
-        With the full name of its topic, and its stamp as for `BagReader.samples`.
+        With the full name of its topic.
 
     """
 
@@ -58,8 +58,6 @@ class BagInputs:
         known = known_inputs(values, model.used_inputs, channel)
         self._u = {name: full(its) for name, its in known.items()}
         self.y = full(measured_output(values, channel))
-        if self.y.stamp == 'reception':
-            self.y = self.y._replace(stamp='bag')
 
     def samples(self) -> tuple[FieldSamples, Field]:
         """
@@ -70,7 +68,7 @@ class BagInputs:
         y, stamp, reader = self.y, self.y.stamp, self._reader
         field = reader.field(y.topic, y.field, y.name)
         if stamp == 'auto' and not field.header and self._values['sampling'] == 'clock':
-            stamp = 'bag'  # such an estimator took a sample when it came, not when it was sent
+            stamp = 'reception'  # such an estimator took no sample before it came
         samples = reader.samples(y.topic, field, stamp)
         if not len(samples.times):
             why = next(iter(reader.lacking), 'expected messages, read none')
@@ -96,8 +94,7 @@ class BagInputs:
         arrivals = [_arrivals(samples, SAMPLE)]
         for name, its in self._u.items():
             field = self._reader.field(its.topic, its.field, its.name)
-            stamp = 'header' if its.stamp == 'header' else 'bag'
-            found = self._reader.samples(its.topic, field, stamp)
+            found = self._reader.samples(its.topic, field, its.stamp)
             good = np.isfinite(found.values)
             reject(int((~good).sum()))
             arrivals.append(_arrivals(found.part(good), names.index(name)))

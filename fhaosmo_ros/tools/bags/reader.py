@@ -232,7 +232,7 @@ class BagReader:
             raise ConfigurationError(f'bag {self.path}: expected a definition of {kind}, got none')
         return find_field(self.types.fielddefs, kind, text, name)
 
-    def samples(self, topic: str, field: Field, stamp: str = 'bag') -> FieldSamples:
+    def samples(self, topic: str, field: Field, stamp: str = 'reception') -> FieldSamples:
         """
         Return the samples of a field; a terminal shows how far it is.
 
@@ -242,10 +242,10 @@ class BagReader:
         ----------
         topic : str
         field : Field
-        stamp : {'auto', 'header', 'source', 'bag'}
+        stamp : {'auto', 'header', 'source', 'reception'}
             'header': of the messages. 'source': the publish time, which only mcap has; `ros2 bag
-            record` writes the publisher's source stamp there. 'bag': of the bag (mcap: log time),
-            for `ros2 bag record` the time of reception. 'auto': the first of these that there is.
+            record` writes the publisher's source stamp there. 'reception': of the bag (mcap: log
+            time). 'auto': the first of these that there is.
 
         Raises
         ------

@@ -82,15 +82,11 @@ def read_ticks(path: Path, name: str, parts: Sequence[str]) -> dict[str, NDArray
         Topics below it; the last one is published last.
 
     """
-    ticks = series(path, f'{name}/{parts[-1]}').stamps
-    whole = np.ones(len(ticks), bool)
-    found = {}
-    for part in parts:  # one after the other: a long bag fills the memory
-        column = series(path, f'{name}/{part}')
-        row = _rows_of_ticks(column.stamps, ticks)
-        whole &= row >= 0
-        found[part] = column.values[row] if len(column.values) else column.values
-    return {part: values[whole] if whole.any() else values[:0] for part, values in found.items()}
+    found = {part: series(path, f'{name}/{part}') for part in parts}
+    ticks = found[parts[-1]].stamps
+    rows = {part: _rows_of_ticks(topic.stamps, ticks) for part, topic in found.items()}
+    whole = np.all([row >= 0 for row in rows.values()], axis=0)
+    return {part: topic.values[rows[part][whole]] for part, topic in found.items()}
 
 
 def _rows_of_ticks(times: NDArray[np.int64], ticks: NDArray[np.int64]) -> NDArray[np.int64]:

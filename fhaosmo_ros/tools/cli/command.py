@@ -146,9 +146,9 @@ def shipped(relative: str) -> Path:
         The file is in none of these places.
 
     """
-    prefixes = [p for p in os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep) if p]
+    prefixes = filter(None, os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep))
     places = [Path(__file__).resolve().parents[3]]
-    places += [Path(prefix) / 'share' / 'fhaosmo_ros' for prefix in [*prefixes, sys.prefix]]
+    places += [Path(prefix, 'share', 'fhaosmo_ros') for prefix in (*prefixes, sys.prefix)]
     for place in places:
         if (place / relative).is_file():
             return place / relative
