@@ -18,8 +18,6 @@ COLOURS = ('#D55E00', '#009E73', '#CC79A7', '#E69F00', '#56B4E9')
 OTHERS = ('#bbbbbb', *COLOURS[1:])
 """Of what the run is compared with: what chatters is grey."""
 DASHES = ('-', '--', '-.', ':')
-TINY = 1e-300
-"""Added to what is drawn on a logarithmic scale, which has no place for zero."""
 COLUMNS = 1500
 """Of a thinned curve; more than a figure has pixels in a row."""
 
@@ -148,14 +146,12 @@ def _draw_innovations(
     """Draw |eps_1| .. |eps_N| on a logarithmic scale, and the band within which gates open."""
     size = np.abs(eps)
     for k in range(eps.shape[1]):
-        axes.plot(*envelope(t, size[:, k] + TINY), linewidth=0.8, label=f'ε{k + 1}')
-    axes.set_yscale('log')
+        axes.semilogy(*envelope(t, size[:, k]), linewidth=0.8, label=f'ε{k + 1}')
     size = size[size > 0.0]
     if len(size):
-        top = size.max() * 3.0
-        axes.set_ylim(np.percentile(size, 1, overwrite_input=True) / 3.0, top)
+        axes.set_ylim(np.percentile(size, 1) / 3.0, 3.0 * size.max())
     if epsilon is not None:
         low, high = axes.get_ylim()
-        axes.set_ylim(low, max(high, 3.0 * epsilon))
         axes.axhspan(low, epsilon, color='grey', alpha=0.15, label='band ε')
+        axes.set_ylim(low, max(high, 3.0 * epsilon))
     axes.legend(loc='upper right', ncols=5, fontsize='small')
