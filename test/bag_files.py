@@ -17,9 +17,10 @@ PRESETS = {
     'zstd': {'compression': CompressionType.ZSTD},
     'lz4': {'compression': CompressionType.LZ4},
     'fastwrite': {'use_chunking': False},
+    'fastwrite_crc': {'use_chunking': False, 'enable_data_crcs': True},
     'zstd_fast': {'compression': CompressionType.ZSTD, 'enable_crcs': False},
 }
-"""Of Jazzy's mcap storage."""
+"""Of Jazzy's mcap storage, and one with a CRC of all that is not in chunks."""
 
 
 def signal(count):

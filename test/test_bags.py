@@ -78,7 +78,7 @@ def test_every_storage_and_compression_is_read(storage, compression, version, tm
     assert read(bag) == COUNT
     with BagReader(bag) as reader:
         other = reader.samples('/other', reader.field('/other', None))
-        assert reader.unchecked == (storage not in ('plain', 'zstd', 'lz4'))
+        assert reader.unchecked == (storage not in ('plain', 'zstd', 'lz4', 'fastwrite_crc'))
     np.testing.assert_array_equal(other.stamps, STAMPS + 1)
     np.testing.assert_array_equal(other.values, -Y)
 
@@ -101,7 +101,7 @@ def test_bag_whose_qos_differs_from_its_storage_is_read(tmp_path):
     assert read(bag) == COUNT
 
 
-@pytest.mark.parametrize('how', ['ours', 'zstd', 'lz4'])
+@pytest.mark.parametrize('how', ['ours', 'zstd', 'lz4', 'fastwrite_crc'])
 def test_damage_in_a_file_with_checksums_is_an_error(how, tmp_path):
     """Single bits and zeros, half of them in the summary: topics, types and where chunks are."""
     bag = make(tmp_path / 'bag', how)

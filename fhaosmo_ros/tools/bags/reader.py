@@ -180,7 +180,6 @@ class BagReader:
             if not c.channel_count or not chosen.keys().isdisjoint(c.channel_count)
         )
         if not storage.chunks:  # all is kept in memory, to put it in order
-            self.unchecked = True
             parts = [(0, storage.data_start, storage.data_end)]
         rows: list[Row] = []
         with mmap(storage.bio.fileno(), 0, access=ACCESS_READ) as file:
@@ -212,6 +211,11 @@ class BagReader:
                 self.unchecked |= not chunk.uncompressed_crc
                 stream, size = get_chunk_data_stream(chunk, validate_crc=True)
                 yield from self._messages(stream.read(size), 0, size, chosen)
+            elif opcode == Opcode.DATA_END:
+                crc = int.from_bytes(data[begin:at], 'little')
+                self.unchecked |= not crc
+                if crc and crc32(memoryview(data)[: begin - RECORD.size]) != crc:
+                    raise ValueError('the messages do not agree with their CRC')
 
     def objects(self, topics: Collection[str]) -> Iterator[tuple[str, int, Any, int]]:
         """Yield topic, stamp (ns), message and publish time of the messages of some topics."""
