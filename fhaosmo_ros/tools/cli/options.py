@@ -2,7 +2,7 @@
 """Command-line options that several commands share."""
 
 import argparse
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,23 +25,22 @@ from fhaosmo_ros.inputs import with_joints
 from fhaosmo_ros.tools.bags.topics import Recorded
 
 
-def add_value_options(parser: argparse.ArgumentParser, which: str, over: str = 'file') -> None:
-    """Add --params-file, whose help says `which` parameters, and -p, which wins `over` what."""
+def add_value_options(parser: argparse.ArgumentParser, which: str) -> None:
+    """Add --params-file, whose help says `which` parameters, and -p."""
     parser.add_argument(
         '--params-file', type=Path, action='append', default=[], metavar='FILE', help=which
     )
     parser.add_argument(
         '-p', '--param', action='append', default=[], metavar='NAME:=VALUE',
-        help=f'set one parameter; wins over the {over}',
+        help='set one parameter; wins over files, and over a bag',
     )  # fmt: skip
 
 
 def add_parameter_options(parser: argparse.ArgumentParser) -> None:
     """Add --params-file, -p, --node and --channel."""
     add_value_options(
-        parser, "parameters of the estimator node, as in 'ros2 run' (default: those in the bag)",
-        'file, or the bag',
-    )  # fmt: skip
+        parser, "parameters of the estimator node, as in 'ros2 run' (default: those in the bag)"
+    )
     parser.add_argument(
         '--node', default='estimator', metavar='NAME',
         help='whose sections of the files to take, such as /rig/estimator (default: %(default)s)',
@@ -72,17 +71,15 @@ def channel_parameters(
     """
     values: dict[str, Any] = {}
     origins: dict[str, Path | str | None] = {}
+    given: list[tuple[Path | str | None, Mapping[str, Any]]] = []
     if recorded:
-        values = dict(recorded.values)
-        origins = dict.fromkeys(values, f'topic {recorded.topic!r}')
-    for path in arguments.params_file:
-        of_file = read(path, arguments.node, strict=True)
-        values |= of_file
-        origins |= dict.fromkeys(of_file, path)
-    on_command_line = _on_command_line(arguments)
-    origins |= dict.fromkeys(on_command_line)
+        given.append((f'topic {recorded.topic!r}', recorded.values))
+    given += [(path, read(path, arguments.node, strict=True)) for path in arguments.params_file]
+    for origin, found in [*given, (None, _on_command_line(arguments))]:
+        values |= found
+        origins |= dict.fromkeys(found, origin)
     try:
-        values = select(values | on_command_line, ESTIMATOR_PARAMETERS)
+        values = select(values, ESTIMATOR_PARAMETERS)
     except ConfigurationError as error:
         raise with_origin(error, origins) from None
     own = of_named_channel(with_joints(values), arguments.channel, '--channel')

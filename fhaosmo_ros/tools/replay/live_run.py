@@ -21,12 +21,11 @@ AGREEMENT = 1e-12
 """Relative or absolute difference up to which two memories count as the same."""
 COMPARED = 'z_hat', 'z_tilde', 'p', 'q', 'gamma', 'y', 'pending'
 """What snapshots of every version hold of a state."""
-VALUE_FIELDS = {
-    1: 'bool_value', 2: 'integer_value', 3: 'double_value', 4: 'string_value',
-    6: 'bool_array_value', 7: 'integer_array_value', 8: 'double_array_value',
-    9: 'string_array_value',
-}  # fmt: skip
-"""Field of a rcl_interfaces/msg/ParameterValue that holds the value, by the number of its type."""
+KINDS = (
+    '', 'bool', 'integer', 'double', 'string', 'byte_array', 'bool_array', 'integer_array',
+    'double_array', 'string_array',
+)  # fmt: skip
+"""Of a rcl_interfaces/msg/ParameterValue, by number: the value is in the field KIND_value."""
 
 
 class Event(NamedTuple):
@@ -206,7 +205,7 @@ def _read_events(reader: BagReader, name: str, fixed: Collection[str]) -> list[E
                 for parameter in message.changed_parameters:
                     of_channel, key = split(parameter.name)
                     if of_channel == channel and key in ONLINE_PARAMETERS and key not in fixed:
-                        value = getattr(parameter.value, VALUE_FIELDS[parameter.value.type])
+                        value = getattr(parameter.value, f'{KINDS[parameter.value.type]}_value')
                         changes[key] = ONLINE_PARAMETERS[key].coerce(value)
             continue
         try:
