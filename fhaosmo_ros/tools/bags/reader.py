@@ -3,7 +3,7 @@
 
 from bisect import bisect_left
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager, ExitStack
 from io import BytesIO
 from itertools import zip_longest
@@ -151,40 +151,40 @@ class BagReader:
             for storage in self._storages:
                 # By the storage's own connections: AnyReader.messages() yields nothing, and says
                 # nothing, where the QoS of metadata.yaml differs from the storage file's.
-                chosen = {
-                    c.id: c for c in storage.connections if topics is None or c.topic in topics
-                }
+                chosen = [c for c in storage.connections if topics is None or c.topic in topics]
                 if not chosen:  # rosbags takes that for all
                     continue
-                counts = dict.fromkeys(chosen, 0)
+                names = {c.id: c.topic for c in chosen}
+                counts = dict.fromkeys(names, 0)
                 for time, published, number, data in self._rows(storage, chosen):
                     counts[number] += 1
                     if data[: len(ZSTD)] == ZSTD:  # metadata.yaml says so, but it may be lost
                         data = zstandard.decompress(data)
-                    yield chosen[number].topic, time, data, published
-                for number, c in chosen.items():
-                    _expect(c.topic, c.msgcount, counts[number])
+                    yield names[number], time, data, published
+                for c in chosen:
+                    _expect(c.topic, c.msgcount, counts[c.id])
 
-    def _rows(self, storage: Any, chosen: Mapping[int, Connection]) -> Iterator[Row]:
+    def _rows(self, storage: Any, chosen: list[Connection]) -> Iterator[Row]:
         """Yield messages by log time, with the publish time of mcap, which rosbags leaves out."""
         if not isinstance(storage, McapReader):
             self.unchecked = True
-            for c, stamp, data in storage.messages(chosen.values()):
+            for c, stamp, data in storage.messages(chosen):
                 yield stamp, 0, c.id, data
             return
         assert storage.bio
+        channels = {c.id for c in chosen}
         # Without message indexes it is not known which channels a chunk holds.
         parts = sorted(
             (c.message_start_time, c.chunk_start_offset, c.chunk_start_offset + c.chunk_length)
             for c in storage.chunks
-            if not c.channel_count or not chosen.keys().isdisjoint(c.channel_count)
+            if not c.channel_count or not channels.isdisjoint(c.channel_count)
         )
         if not storage.chunks:  # all is kept in memory, to put it in order
             parts = [(0, storage.data_start, storage.data_end)]
         rows: list[Row] = []
         with mmap(storage.bio.fileno(), 0, access=ACCESS_READ) as file:
             for (_, begin, end), following in zip_longest(parts, parts[1:]):
-                rows += self._messages(file, begin, end, chosen)
+                rows += self._messages(file, begin, end, channels)
                 rows.sort(key=itemgetter(0))
                 # Chunks may overlap: what lies behind the next one's begin has to wait.
                 ready = len(rows)
@@ -194,23 +194,24 @@ class BagReader:
                 del rows[:ready]
 
     def _messages(
-        self, data: bytes | mmap, at: int, end: int, chosen: Mapping[int, Connection]
+        self, data: bytes | mmap, at: int, end: int, channels: Collection[int]
     ) -> Iterator[Row]:
         """Yield the messages in some records of an mcap file, also those in chunks."""
+        of_messages = int(Opcode.MESSAGE)  # which is quicker to compare with
         while at < end:
             opcode, length = RECORD.unpack_from(data, at)
             begin, at = at + RECORD.size, at + RECORD.size + length
             if at > end:
                 raise ValueError('a record goes beyond the end of its chunk')
-            if opcode == Opcode.MESSAGE:
+            if opcode == of_messages:
                 channel, _, logged, published = MESSAGE.unpack_from(data, begin)
-                if channel in chosen:
+                if channel in channels:
                     yield logged, published, channel, data[begin + MESSAGE.size : at]
             elif opcode == Opcode.CHUNK:
                 chunk = Chunk.read(ReadDataStream(BytesIO(data[begin:at])))
                 self.unchecked |= not chunk.uncompressed_crc
                 stream, size = get_chunk_data_stream(chunk, validate_crc=True)
-                yield from self._messages(stream.read(size), 0, size, chosen)
+                yield from self._messages(stream.read(size), 0, size, channels)
             elif opcode == Opcode.DATA_END:
                 crc = int.from_bytes(data[begin:at], 'little')
                 self.unchecked |= not crc
