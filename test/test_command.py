@@ -19,6 +19,7 @@ PARSER = argparse.ArgumentParser(prog='try')
 @pytest.mark.parametrize(('error', 'code', 'said'), [
     (ConfigurationError('wrong'), 2, 'error: wrong\n'),
     (FileNotFoundError(2, 'No such file', 'x'), 2, 'error: No such file: x\n'),
+    (ConfigurationError("'sql://u:p@ss@h/db': no"), 2, "error: 'sql://u:***@h/db': no\n"),
     (Stopped('nothing written'), 130, 'interrupted, nothing written\n'),
 ])  # fmt: skip
 def test_errors_are_one_line_and_have_their_exit_code(capsys, error, code, said):
@@ -30,17 +31,17 @@ def test_errors_are_one_line_and_have_their_exit_code(capsys, error, code, said)
 
 
 def test_body_gets_its_arguments_and_its_code_is_returned():
-    """Those of ROS are apart, as launch files give them to all programs."""
+    """Those of ROS are apart, as launch files give them to all programs; no password is kept."""
     parser = argparse.ArgumentParser(prog='try')
-    parser.add_argument('--some')
-    of_ros = ['-r', '__node:=x']
+    parser.add_argument('--storage')
+    url, of_ros = 'postgresql://u:p@ss@h/db', ['-r', '__node:=x']
 
     def body(arguments, stop):
-        assert (arguments.some, arguments.ros_arguments) == ('a b', of_ros)
-        assert arguments.command_line.endswith("x -- --some 'a b'")
+        assert (arguments.storage, arguments.ros_arguments) == (url, of_ros)
+        assert arguments.command_line.endswith('x -- --storage postgresql://u:***@h/db')
         return 7
 
-    assert run_command(parser, ['--ros-args', *of_ros, '--', '--some', 'a b'], body) == 7
+    assert run_command(parser, ['--ros-args', *of_ros, '--', '--storage', url], body) == 7
     assert run_command(parser, ['--ros-args', *of_ros], lambda arguments, stop: None) == 0
 
 

@@ -1,12 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """The command `tune` on simulated recordings: its start, its output, its inputs, its ends."""
 
+from contextlib import closing, suppress
 from itertools import product
 import math
 import signal
+import sqlite3
+import subprocess
 import sys
 
-from commands import ROOT
+from commands import ROOT, start, wait_until
 from fhaosmo_ros.core import ConfigurationError, Family, Observer, TriangularModel
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.parameters.files import load
@@ -155,22 +158,29 @@ def test_model_may_stand_in_any_section(tmp_path, section):
 
 
 @pytest.mark.signals
-def test_interrupt_keeps_the_best(tmp_path, monkeypatch):
-    evaluate, seen = Tuner.evaluate, []
+def test_interrupt_keeps_the_best_and_the_next_run_goes_on(tmp_path):
+    out, storage = tmp_path / 'out', tmp_path / 'study.db'
 
-    def interrupted(tuner, values):
-        seen.append(evaluate(tuner, values))
-        if len(seen) == 4:
-            signal.raise_signal(signal.SIGINT)
-        return seen[-1]
+    def finished():
+        with closing(sqlite3.connect(storage)) as base, suppress(sqlite3.OperationalError):
+            (row,) = base.execute("SELECT count(*) FROM trials WHERE state='COMPLETE'")
+            return row[0]
+        return 0  # its tables are made right now
 
-    monkeypatch.setattr(Tuner, 'evaluate', interrupted)
-    command = [*QUICK, '-pscheme:=explicit', '--jobs=1', '--trials=1000']
-    assert main([*command, '-o', str(tmp_path / 'out')]) == 0
-    assert len(seen) == 4
-    assert f'# {len(seen)} trials' in (tmp_path / 'out' / 'gains.yaml').read_text()
-    report = (tmp_path / 'out' / 'report.md').read_text()
-    assert f'{min(seen):.4f}' == row(report, 'error, relative')[4].strip()
+    command = [*QUICK, '-pscheme:=explicit', '--jobs=1', '--force', f'-o{out}']
+    command.append(f'--storage=sqlite:///{storage}')
+    with start('tune', *command, '--trials=1000000', stdout=subprocess.DEVNULL) as process:
+        try:
+            wait_until(lambda: finished() > 3, 'trial', process=process)
+            process.send_signal(signal.SIGINT)
+            assert process.wait(300.0) == 0
+        finally:
+            process.kill()
+    load(out / 'gains.yaml', 'estimator')
+    trials = finished() + 2
+    assert main([*command, f'--trials={trials}']) == 0
+    assert f'# {trials} trials' in (out / 'gains.yaml').read_text()
+    assert finished() == trials
 
 
 @pytest.mark.parametrize('name', ['paper_plant', 'pendulum', 'dc_motor'])

@@ -62,6 +62,7 @@ WRONG = {
     f'{TUNE} -pphi:=[0,0,z3**3] -prms_of_d:=100.0': ['expected states that stay finite'],
     f'{TUNE} -psettled:=4.0': ['more than 4 s'],
     f'{TUNE} --trials=0': ['--trials >= 1'],
+    f'{TUNE} --storage nodb://x': ['storage'],
     f'{TUNE} -o /proc/no/out': ['output'],
     f'{TUNE} -o bag': ['expected a new name (or --force'],
     'tune --bag bag -o out -p structure:=cascade': ['got structure set'],
@@ -106,6 +107,8 @@ def test_wrong_input_is_said_in_one_line_and_leaves_nothing(call, place, capfd, 
         pytest.importorskip('rclpy', reason='no ROS 2 in this Python')
     elif command == 'calibrate':
         pytest.importorskip('pinocchio', reason='pinocchio is not installed (extra: arm)')
+    elif '--storage' in arguments:
+        pytest.importorskip('optuna', reason='optuna is not installed (extra: tune)')
     monkeypatch.chdir(place)
     before = sorted(place.rglob('*'))
     assert main([command, *arguments]) == 2

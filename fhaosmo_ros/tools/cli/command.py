@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from functools import partial
 import os
 from pathlib import Path
+import re
 import shlex
 import shutil
 import sys
@@ -38,8 +39,9 @@ def run_command(parser: argparse.ArgumentParser, argv: Sequence[str] | None, bod
         What follows the command's name; ``sys.argv[1:]`` by default.
     body : callable
         Gets the parsed arguments and the event. ``arguments.command_line`` is what was typed,
-        as outputs keep it; ``arguments.ros_arguments`` is the part of it between ``--ros-args``
-        and ``--`` or the end, which a launch file adds to every program.
+        without the passwords in URLs, as outputs keep it; ``arguments.ros_arguments`` is the
+        part of it between ``--ros-args`` and ``--`` or the end, which a launch file adds to every
+        program.
 
     Returns
     -------
@@ -58,7 +60,7 @@ def run_command(parser: argparse.ArgumentParser, argv: Sequence[str] | None, bod
         own, of_ros = given[:begin] + given[end + 1 :], given[begin + 1 : end]
     arguments = parser.parse_args(own)
     arguments.ros_arguments = of_ros
-    arguments.command_line = shlex.join([parser.prog, *given])
+    arguments.command_line = without_password(shlex.join([parser.prog, *given]))
     stop = stop_on_signals()
     try:
         return body(arguments, stop) or 0
@@ -69,8 +71,13 @@ def run_command(parser: argparse.ArgumentParser, argv: Sequence[str] | None, bod
         text, code = f'error: {error.strerror or error}{place}', 2
     except Stopped as error:
         text, code = f'interrupted{f", {error}" if str(error) else ""}', 130
-    print(f'{parser.prog}: {text}', file=sys.stderr)
+    print(f'{parser.prog}: {without_password(text)}', file=sys.stderr)
     return code
+
+
+def without_password(text: str) -> str:
+    """Return a text with ``***`` in place of the password of each URL in it."""
+    return re.sub(r'(://[^:/@\s]*:)\S*@', r'\1***@', text)
 
 
 class Output:

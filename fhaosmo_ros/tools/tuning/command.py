@@ -52,9 +52,17 @@ def main(argv: list[str] | None = None) -> int:
         help='find the gains that are likeliest for its y (of input_topic, input_field)',
     )  # fmt: skip
     add = parser.add_argument_group('from simulated recordings').add_argument
-    add('--trials', type=int, default=TRIALS, metavar='N', help='default: %(default)s')
+    add(
+        '--trials', type=int, default=TRIALS, metavar='N',
+        help='that the study shall hold at the end (default: %(default)s)',
+    )  # fmt: skip
     add('--jobs', type=int, metavar='N', help='trials at a time (default: one a core)')
     add('--seed', type=int, default=1, help='of recordings and search (default: %(default)s)')
+    add(
+        '--storage', metavar='URL',
+        help='data base of an Optuna study that several tune share, and that can be continued: '
+        'sqlite:///study.db, postgresql+psycopg://... (default: in memory)',
+    )  # fmt: skip
     return run_command(parser, argv, _tune)
 
 
@@ -76,7 +84,8 @@ def _tune(arguments: argparse.Namespace, stop: Stop) -> None:
                 print(f'{len(training)} recordings to train on, {len(held_out)} held out')
                 tuner = Tuner(training, held_out, estimator, values, arguments.seed)
             jobs = arguments.jobs or os.cpu_count() or 1
-            found = report.of_search(tuner, tuner.search(arguments.trials, jobs, stop.is_set))
+            result = tuner.search(arguments.trials, jobs, arguments.storage, stop.is_set)
+            found = report.of_search(tuner, result)
         report.save(output.path, arguments.command_line, found)
         folder = output.keep()
     print(f'\n{found.main}\n')

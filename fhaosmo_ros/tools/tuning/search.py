@@ -36,7 +36,7 @@ class Result(NamedTuple):
 
     best: Values  # by name
     value: float  # the objective there
-    trials: int  # evaluations
+    trials: int  # finished ones of the study, also those of other processes
 
 
 def minimise(
@@ -45,6 +45,8 @@ def minimise(
     trials: int,
     seed: int = 1,
     *,
+    storage: str | None = None,
+    name: str = 'study',
     jobs: int = 1,
     on_trial: Callable[[], object] = lambda: None,
 ) -> Result:
@@ -57,18 +59,21 @@ def minimise(
         From values by name to a number; one that is not finite counts as `BAD`.
     space : sequence of Dimension
     trials : int
-        Evaluations at most. The first one is at the start of each dimension.
+        Evaluations that the study shall hold at the end, with those that are in it already. The
+        first one is at the start of each dimension.
     seed : int
-        With one job, the result is a function of it.
+        With one job and no storage, the result is a function of it.
+    storage, name : str, optional
+        As for `optuna.create_study`; in memory by default.
     jobs : int
         Threads: an objective should spend its time in compiled code without the GIL.
     on_trial : callable
-        Called after each trial; True ends the search with the best one so far.
+        Called after each trial of this process; True ends the search with the best one so far.
 
     Raises
     ------
     ConfigurationError
-        Optuna is not installed.
+        Optuna cannot use the storage, or is not installed.
 
     """
     try:  # here, as only this search needs them: a robot may lack them
@@ -81,6 +86,7 @@ def minimise(
         ) from None
     optuna.logging.set_verbosity(optuna.logging.ERROR)
     start = {d.name: d.start for d in space}
+    finished = (optuna.trial.TrialState.COMPLETE,)
 
     def evaluate(trial: Any) -> float:
         values = {d.name: trial.suggest_float(d.name, d.low, d.high, log=d.log) for d in space}
@@ -97,7 +103,17 @@ def minimise(
         sampler = optuna.samplers.CmaEsSampler(
             x0=start, sigma0=SIGMA, seed=seed, warn_independent_sampling=False
         )
-    study = optuna.create_study(sampler=sampler)
-    study.enqueue_trial(start)
-    study.optimize(evaluate, trials, n_jobs=jobs, callbacks=[after])
-    return Result(study.best_params, study.best_value, len(study.trials))
+    try:
+        study = optuna.create_study(
+            storage=storage, sampler=sampler, study_name=name, load_if_exists=True
+        )
+    except Exception as error:  # SQLAlchemy and each driver have exceptions of their own
+        first = str(error).partition('\n')[0]
+        raise ConfigurationError(f'storage {storage!r}: Optuna cannot use it: {first}') from None
+    done = len(study.get_trials(deepcopy=False, states=finished))
+    if not done:
+        study.enqueue_trial(start, skip_if_exists=True)
+    enough = optuna.study.MaxTrialsCallback(trials, states=finished)  # of all processes
+    study.optimize(evaluate, max(trials - done, 0), n_jobs=jobs, callbacks=[after, enough])
+    count = len(study.get_trials(deepcopy=False, states=finished))
+    return Result(dict(study.best_params), study.best_value, count)

@@ -9,7 +9,9 @@ themselves, from the user's, or the default ones.
 """
 
 from collections.abc import Callable, Mapping, Sequence
+import hashlib
 from itertools import product
+import json
 import math
 from typing import Any
 
@@ -135,6 +137,13 @@ class Tuner:
             found |= {'noise_size': noise, 'state_sizes': sizes[:-1]}
         return noise, found | {'fuzzy_widths': [WIDTH * noise]}
 
+    @property
+    def _study_name(self) -> str:
+        """Name of the study: a digest of all that its trials depend on."""
+        samples = [recording.y.tobytes() for recording in self.training.recordings]
+        problem = json.dumps([dict(self.tuning), self._fixed, self.space], sort_keys=True)
+        return f'tune-{hashlib.sha256(b"".join([problem.encode(), *samples])).hexdigest()[:16]}'
+
     def parameters(self, values: Values) -> dict[str, Any]:
         """
         Return the parameters of the estimator at a point of the space.
@@ -169,7 +178,11 @@ class Tuner:
             return math.inf
 
     def search(
-        self, trials: int, jobs: int = 1, stopped: Callable[[], bool] = lambda: False
+        self,
+        trials: int,
+        jobs: int = 1,
+        storage: str | None = None,
+        stopped: Callable[[], bool] = lambda: False,
     ) -> Result:
         """Search as `minimise` does, or until `stopped` returns True after a trial."""
         with progress(total=trials, unit='trial', desc='tune', smoothing=0.05) as bar:
@@ -179,8 +192,9 @@ class Tuner:
                 return stopped()
 
             return minimise(
-                self.evaluate, self.space, trials, self._seed, jobs=jobs, on_trial=on_trial
-            )
+                self.evaluate, self.space, trials, self._seed, storage=storage,
+                name=self._study_name, jobs=jobs, on_trial=on_trial,
+            )  # fmt: skip
 
 
 def _make_space(names: Sequence[str], observer: Observer) -> list[Dimension]:
