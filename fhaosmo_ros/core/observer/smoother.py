@@ -6,7 +6,7 @@ from typing import Any
 from fhaosmo_ros.core.model.inputs import known_inputs
 from fhaosmo_ros.core.observer.configuration import DERIVATIVES, Floats
 from fhaosmo_ros.core.observer.estimates import Estimate, Trajectory, TUNING
-from fhaosmo_ros.core.observer.smoothing import BEGINS, JUMPS, MEASURED, Rows, UNMEASURED
+from fhaosmo_ros.core.observer.smoothing import Kind, MODEL, Passes, POINT
 from fhaosmo_ros.core.observer.status import AFRESH, JUMPED, LEVEL_SHIFT, REJECTED, UNUSED
 from fhaosmo_ros.core.observer.structure import Record
 import numpy as np
@@ -58,27 +58,30 @@ class Smoother:
 
     def __init__(self, observer: Any, lag: int | None = None, every: bool = False) -> None:
         self._observer, self._lag, self._every = observer, lag, every
-        self._rows, self._wait = Rows(observer.configuration), BLOCK
-        self._expected = {JUMPS: 0, BEGINS: 1}
-        self._held: list[NDArray[Any]] = []  # rows that wait for a self-tuning observer's model
-        self._model: Floats | None = None  # the latest one
+        self._expected = {Kind.JUMPS: False, Kind.BEGINS: True}
         self._time: Any = None
-        self._taken = 0
-        nothing: Ints = np.zeros(0, dtype=np.int64)
-        self._found = Trajectory(nothing, **Record(observer.structure, 0).columns)  # they wait
-        self._numbers = self.numbers = nothing
+        self._taken = 0  # samples so far
+        # Of these rows those from `done` on wait to be handed out, those from `passed` on for a
+        # self-tuning observer's model, and those from `count` on are room for some more.
+        self._rows = np.zeros(0, dtype=POINT)
+        self._done = self._passed = self._count = 0
+        self._wait = BLOCK
+        self.numbers: Ints = np.zeros(0, dtype=np.int64)
+        found = Record(observer.structure, 0).columns
+        self._waiting = [*Trajectory(self.numbers, **found), self.numbers]  # the same rows
         self.estimate: Estimate | None = None
         self.stamp = 0
         self.standard_deviation = np.full(observer.order + 1, np.nan)
         self.tuning = np.full(len(TUNING), np.nan)
+        self.configure()
 
     def configure(self) -> None:
         """Go on with the observer's present parameters; raise as the constructor."""
-        self._rows.configure(self._observer.configuration)
+        self._passes = Passes(self._observer.configuration)
 
     def cut(self) -> None:
         """Let the next row begin: it has nothing to do with those before it, which are due."""
-        self._expected[BEGINS], self.estimate = 1, None
+        self._expected[Kind.BEGINS], self.estimate = True, None
 
     def take(self, found: Trajectory, times: NDArray[Any], u: Floats) -> Trajectory:
         """
@@ -92,33 +95,28 @@ class Smoother:
             The observer's time after each, in ns if integers, else in s; the inputs until then.
 
         """
-        kinds = self._kinds(found.status)
         kept = np.flatnonzero(self._every | ((found.status & UNUSED) == 0))
-        numbers, smoothed = self._taken + kept, []
+        kinds, numbers = self._kinds(found.status)[kept], self._taken + kept
         self._taken += len(times)
-        found, times, u, kinds = found.rows(kept), times[kept], u[kept], kinds[kept]
-        for begin in range(0, max(len(kept), 1), BLOCK):
+        found, times, u = found.rows(kept), times[kept], u[kept]
+        more = zip(self._waiting, [*found, numbers], strict=True)
+        self._waiting = [np.concatenate(pair) for pair in more]
+        smoothed = [self._back(self._done)]
+        for begin in range(0, len(kept), BLOCK):
             block = slice(begin, begin + BLOCK)
-            if len(kept):
-                self._hold(found.rows(block), times[block], u[block], kinds[block])
-            end = self._rows.count
-            if self._lag is None:
-                end = self._rows.done
-                if self._rows.count - end >= self._wait:
-                    end = self._rows.settled()
-                    self._wait = self._rows.count - end + BLOCK
-            smoothed.append(self._rows.smooth(end, self._lag))
-        self._found = Trajectory._make(map(np.concatenate, zip(self._found, found, strict=True)))
-        self._numbers = np.concatenate([self._numbers, numbers])
+            self._append(found.rows(block), times[block], u[block], kinds[block])
+            early = self._lag is None and self._count <= BEGINNING and self._passes.tunes
+            if not early and self._forward():
+                smoothed.append(self._due())
         return self._handed_out(np.concatenate(smoothed))
 
     def finish(self) -> Trajectory:
         """Return the rows that still wait: nothing comes after them."""
-        if self._held and not self._held[-1].any():  # the observer knows nothing but y
-            smoothed, self._held = self._held[0], []
-        else:
-            self._go()
-            smoothed = self._rows.smooth(self._rows.count)
+        if self._forward():
+            smoothed = self._back(self._count)
+        else:  # the observer knows nothing but y
+            smoothed = self._rows['own'][: self._count, :, : self._observer.levels].copy()
+            self._done = self._passed = self._count = 0
         return self._handed_out(smoothed)
 
     def _kinds(self, status: Ints) -> Ints:
@@ -127,72 +125,96 @@ class Smoother:
 
         A jump of y, and a restart, are those of the next sample that is used.
         """
-        kinds: Ints = np.where(status & UNUSED, UNMEASURED, MEASURED)
-        used = np.flatnonzero(kinds == MEASURED)
-        for kind, flags in ((JUMPS, JUMPED), (BEGINS, AFRESH)):
-            marks = self._expected[kind] + np.cumsum((status & flags) > 0)
-            kinds[used[np.diff(marks[used], prepend=0) > 0]] = kind
-            latest = marks[used[-1]] if len(used) else 0
-            self._expected[kind] = int(len(status) > 0 and marks[-1] > latest)
+        kinds: Ints = np.where(status & UNUSED, Kind.UNMEASURED, Kind.MEASURED)
+        used = np.flatnonzero(kinds == Kind.MEASURED)
+        for kind, flags in ((Kind.JUMPS, JUMPED), (Kind.BEGINS, AFRESH)):
+            marks = np.flatnonzero(np.append(self._expected[kind], status & flags)) - 1
+            after = np.searchsorted(used, marks)  # the first one used from each mark on
+            self._expected[kind] = len(used) in after
+            kinds[used[after[after < len(used)]]] = kind
         return kinds
 
-    def _hold(self, found: Trajectory, times: NDArray[Any], u: Floats, kinds: Ints) -> None:
-        """Append rows; a self-tuning observer's wait until it knows a model."""
+    def _append(self, found: Trajectory, times: NDArray[Any], u: Floats, kinds: Ints) -> None:
+        """Append rows; those that have been handed out make room."""
+        c, first, more = self._observer.configuration, self._count, len(times)
+        if first + more > len(self._rows):
+            drop = min(self._done, max(first - 1, 0))  # one goes before those to come
+            kept = self._rows[drop:first]
+            self._rows = np.concatenate([kept, np.zeros(len(kept) + 2 * more + 64, dtype=POINT)])
+            self._done, self._passed, first = self._done - drop, self._passed - drop, len(kept)
+        self._count = first + more
+        rows, n = self._rows[first : self._count], c.levels
         h = np.diff(times, prepend=times[0] if self._time is None else self._time)
-        h, self._time = h * 1e-9 if h.dtype.kind == 'i' else h, times[-1]
-        if self._lag is None:  # no age matters
-            times = np.zeros(len(times), dtype=np.int64)
-        c = self._observer.configuration
-        own = np.full((len(h), 1 + c.self_tuning, c.levels), np.inf)
-        own[:, 0] = found.z_hat
+        rows['h'], self._time = h * 1e-9 if h.dtype.kind == 'i' else h, times[-1]
+        rows['time'], rows['kind'], rows['u'][:, : u.shape[1]] = times, kinds, u
+        rows['y'] = found.z_hat[:, 0] + found.innovation[:, 0]  # less its offset (D 23)
+        own, deviations = rows['own'], found.standard_deviation
+        own[:, 0, :n], own[:, 1] = found.z_hat, np.inf
         if c.internal:
-            own[:, 0, 1:] = found.z_tilde[:, :-1]
-        if c.self_tuning:
-            own[:, 1, : found.standard_deviation.shape[1]] = found.standard_deviation**2
-        y = found.z_hat[:, 0] + found.innovation[:, 0]  # less its offset (D 23)
-        rows = [own, y, h, u, times, kinds, found.model]
-        if self._held:
-            rows = [np.concatenate(pair) for pair in zip(self._held, rows, strict=True)]
-        self._held, early = rows, self._lag is None and len(rows[0]) <= BEGINNING
-        if not c.self_tuning or self._model is not None or (rows[-1].any() and not early):
-            self._go()
+            own[:, 0, 1:n] = found.z_tilde[:, :-1]
+        own[:, 1, : deviations.shape[1]] = deviations**2
+        models = found.model.T if c.self_tuning else self._passes.model
+        for name, values in zip(MODEL, models, strict=True):
+            rows[name] = values
 
-    def _go(self) -> None:
-        """Go forward through the rows that are held."""
-        if self._held:
-            (own, *samples, models), self._held = self._held, []
-            if self._observer.self_tuning:
-                models = self._completed(own, models)
-            self._rows.append(own, *samples, models)
+    def _forward(self) -> bool:
+        """Go forward through the rows that wait for it, unless no model of d is known yet."""
+        rows, new = self._rows[: self._count], self._passed
+        if self._passes.tunes:
+            if not new and not rows['intensity'].any():
+                return False
+            self._complete(new)
+        self._passes.forward(rows, new)
+        self._passed = self._count
+        return True
 
-    def _completed(self, own: Floats, models: Floats) -> Floats:
+    def _complete(self, new: int) -> None:
         """Let what a self-tuning observer knows stand for what it did not know before (D 34)."""
-        numbers, known = np.arange(len(models)), models[:, 1] > 0.0  # it has a q
-        latest = np.maximum.accumulate(np.where(known, numbers, -1))
-        if self._model is None:
+        rows = self._rows[max(new - 1, 0) : self._count]
+        own, numbers, known = rows['own'], np.arange(len(rows)), rows['intensity'] > 0.0
+        latest = np.maximum.accumulate(np.where(known, numbers, 0))
+        if not new:
             first = int(np.argmax(known))
             own[:first, :, 1:] = own[first, :, 1:]
             stands = first if self._lag is not None else max(first, min(BEGINNING, numbers[-1]))
-            latest[:stands], self._model = latest[stands], models[first]
-        own[:, 0, -DERIVATIVES:] = 0.0  # those of d are not relied on
-        models = np.vstack([models, self._model])[latest]
-        models[latest != numbers, 3] %= DERIVATIVES + 1  # d has not jumped at each of them
-        self._model = models[-1]
-        return models
+            latest[:stands] = latest[stands]
+        own[:, 0, self._observer.levels - DERIVATIVES :] = 0.0  # those of d are not relied on
+        for name in MODEL:
+            rows[name] = rows[name][latest]
+        # d has not jumped at each of them.
+        rows['derivatives'][latest != numbers] %= DERIVATIVES + 1
+
+    def _due(self) -> Floats:
+        """Return the estimates that have become final."""
+        end = self._count
+        if self._lag is None:
+            end = self._done
+            if self._count - end >= self._wait:
+                end = self._passes.settled(self._rows[: self._count], end)
+                self._wait = self._count - end + BLOCK
+        return self._back(end, self._lag)
+
+    def _back(self, end: int, lag: int | None = None) -> Floats:
+        """Go back to the rows before `end` that wait; return the estimates of those due."""
+        found = self._passes.back(self._rows[: self._count], self._done, end, lag)
+        self._done += len(found)
+        return found  # type: ignore[no-any-return]
 
     def _handed_out(self, smoothed: Floats) -> Trajectory:
         """Return the oldest rows with their smoothed estimates; they wait no more."""
         count, n = len(smoothed), self._observer.order
-        rows, self._found = self._found.rows(slice(count)), self._found.rows(slice(count, None))
-        self.numbers, self._numbers = self._numbers[:count], self._numbers[count:]
+        *columns, self.numbers = (column[:count] for column in self._waiting)
+        self._waiting = [column[count:] for column in self._waiting]
+        rows = Trajectory(*columns)
         if not count:
             return rows
         rows.z[:], rows.unknown_input[:] = smoothed[:, 0, :n], smoothed[:, 0, n]
-        if self._observer.self_tuning:
+        if self._passes.tunes:
             rows.standard_deviation[:] = np.sqrt(smoothed[:, 1, : n + 1])
             self.standard_deviation, self.tuning = rows.standard_deviation[-1], rows.tuning[-1]
         self.stamp, self.estimate = int(rows.t[-1]), None
-        if self._rows.done > self._rows.began:  # else nothing is due yet since the restart
+        began = (self._rows['kind'][self._done : self._passed] == Kind.BEGINS).any()
+        if self._done and not began:  # else nothing is due yet since the restart
             word = int(rows.status[-1]) | int(rows.open_levels[-1]) << LEVEL_SHIFT
             self.estimate = Estimate(
                 rows.z[-1], rows.unknown_input[-1], rows.gamma[-1], rows.innovation[-1], word

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-A recording, row by row, and what is known of each time by all of it (D 24, D 25, D 34).
+What is known of each time by all of a recording (D 24, D 25, D 34).
 
 An extended Kalman filter goes forward, with D 17 as the model of d; the recursion of Rauch, Tung
 and Striebel goes back, in the form of Bierman, which inverts no matrix. The observer says which
@@ -35,7 +35,8 @@ cdef double ROUNDING = 1e-12
 cdef double DOUBT = STATES_DOUBT
 
 
-cpdef enum:
+cpdef enum Kind:
+    # Of a row.
     MEASURED  # a sample that was used
     UNMEASURED  # a time at which none was used
     JUMPS  # the first sample that was used after a jump of y alone (D 23)
@@ -43,32 +44,35 @@ cpdef enum:
 
 
 cdef struct Point:
-    # A row.
+    # A row: what is given.
     double y  # sample, less its offset (D 23)
     double h  # time since the row before (s)
+    long long time  # ns
+    int kind  # MEASURED .. BEGINS
+    int last  # the level that white noise drives; found by going forward
+    double u[MOST_INPUTS]  # known inputs since the row before
+    Row own[2]  # the observer's estimates; if it tunes itself, their variances
     double variance  # of the noise on y
     double intensity  # of the white noise that drives the last level of d
     double decay  # kappa of D 26 (1/s), with d and its derivatives as there; 0: as in phi
     double derivatives  # k of the model of d; k - 4: d has jumped since the row before (D 33)
+    # What going forward finds.
+    double spread  # size of the innovations over that expected, at least 1 (D 21)
     double pull  # e / S; this and the next two are 0 without a sample
     double certainty  # 1 / S
     double noise  # variance that the sample is taken to have
-    long long time  # ns
-    int kind  # MEASURED .. BEGINS
-    int last  # the level that white noise drives
-    double u[MOST_INPUTS]  # known inputs since the row before
-    Row own[2]  # the observer's estimates; if it tunes itself, their variances
     double x[MOST_LEVELS]  # z, d and its derivatives, predicted from the rows before
     Row p[MOST_LEVELS]  # P of its errors
     Row f[MOST_LEVELS]  # F from the row before; 0 where a row begins
 
 cdef Point example
 POINT = np.asarray(<Point[:1]> &example).dtype
+MODEL = ['variance', 'intensity', 'decay', 'derivatives']
 
 
-cdef class Rows:
+cdef class Passes:
     """
-    The rows of a recording, in their order; they are dropped once they have been handed out.
+    The ways forward and back through rows, which are arrays of the type `POINT`.
 
     Parameters
     ----------
@@ -81,44 +85,29 @@ cdef class Rows:
 
     """
 
-    # What the parameters say.
     cdef readonly object configuration
+    cdef readonly object model  # `MODEL` of each row, with fixed gains
+    cdef readonly bint tunes  # a self-tuning observer: the model of d is another one in each row
     cdef Prediction prediction
-    cdef int n, order, inputs  # levels; states and known inputs of the model
-    cdef bint tunes  # a self-tuning observer: the model of d is another one in each row
+    cdef int n, order  # levels; states of the model
     cdef bint from_measurement  # z_1 begins at the first sample
     cdef double fastest  # rate of the fastest motion of the model (1/s)
-    cdef object model  # variance, intensity, decay and derivatives of d; of fixed gains
     cdef double[::1] first  # estimates of a fresh observer
     cdef double[::1] state_sizes
     cdef double[:, ::1] fresh  # P of a fresh observer with fixed gains
-    # What it remembers.
-    cdef Memory memory  # the size of the innovations (D 21), nothing else
-    cdef readonly Py_ssize_t count  # rows
-    cdef readonly Py_ssize_t done  # those of them that have been handed out
-    cdef readonly Py_ssize_t began  # the latest one that begins; below 0 if it has been dropped
-    cdef Py_ssize_t new  # the first of those that came last
-    cdef object rows  # an array of `Point`, with room for some more
-    cdef Point[::1] point  # the same
+    cdef Memory memory  # a row's own: the size of the innovations (D 21), nothing else
 
     def __cinit__(self, configuration):
-        self.n, self.order = configuration.levels, configuration.model.order
-        self.inputs, self.tunes = len(configuration.model.inputs), configuration.self_tuning
-        self.rows = self.point = np.empty(0, dtype=POINT)
-        self.configure(configuration)
-
-    def configure(self, configuration):
-        """Go on with other parameters of the same model from the next row on."""
         cdef LinearModel linear
-        p, n, model = configuration.parameters, configuration.levels, configuration.model
-        if (n, model.order, len(model.inputs)) != (self.n, self.order, self.inputs):
-            raise ValueError('smoothing: the parameters are those of another model')
+        p, model = configuration.parameters, configuration.model
+        self.n, self.order = configuration.levels, model.order
+        self.tunes = configuration.self_tuning
         if self.tunes:
             linear = LinearModel(model.slopes_at_rest + np.eye(self.order, k=1), 0.0)
         elif p['noise_size'] > 0.0 and p['unknown_input']:
             its = Uncertainty(model, p, configuration.state_sizes)
             linear, self.fresh = its.linear, its.fresh
-            self.model = its.variance, its.intensity, 0.0, n - 1 - self.order
+            self.model = its.variance, its.intensity, 0.0, self.n - 1 - self.order
         else:
             raise ConfigurationError(
                 "smoothing: expected 'noise_size' > 0 (standard deviation of the noise on y; "
@@ -130,63 +119,34 @@ cdef class Rows:
         self.from_measurement = self.tunes or p['start_from_measurement']
         self.first, self.state_sizes = configuration.initial_estimate, configuration.state_sizes
 
-    def append(self, own, y, h, u, times, kinds, models):
-        """
-        Go forward (D 24) through more rows; some that are done are dropped.
-
-        Parameters
-        ----------
-        own : (K, 1 or 2, N) array
-            The observer's estimates; if it tunes itself, the variances of their errors.
-        y, h : (K,) arrays
-            Samples less their offset (D 23), and the time since the row before (s).
-        u : (K, m) array
-            Known inputs meanwhile.
-        times, kinds : (K,) arrays
-            In ns, for a lag; MEASURED and so on.
-        models : (K, 4) or (K, 0) array
-            `model` of a `Trajectory`.
-
-        """
-        cdef Py_ssize_t more = len(own), drop = max(min(self.done, self.count - 2), 0)
-        if self.count + more > len(self.rows):
-            kept = self.rows[drop:self.count]
-            self.rows = np.concatenate([kept, np.zeros(len(kept) + 2 * more + 64, dtype=POINT)])
-            self.point = self.rows
-            self.count, self.done, self.began = len(kept), self.done - drop, self.began - drop
-        rows = self.rows[self.count:self.count + more]
-        for name, values in zip(
-            ('variance', 'intensity', 'decay', 'derivatives'),
-            models.T if self.tunes else self.model,
-        ):
-            rows[name] = values
-        rows['last'] = self.order + (rows['derivatives'].astype(int) & (ORDERS - 1))
-        rows['time'], rows['kind'], rows['y'], rows['h'] = times, kinds, y, h
-        rows['u'][:, :self.inputs] = u
-        rows['own'][:, :1 + self.tunes, :self.n] = own
-        self.new = self.count
-        for _ in range(more):
-            self.forward(self.count)
-            self.count += 1
+    def __reduce__(self):
+        return Passes, (self.configuration,)
 
     # Forward
 
-    cdef void forward(self, Py_ssize_t k) noexcept nogil:
-        """Go forward to row k (D 24), which holds the sample and the observer's estimate."""
-        cdef Point* now = &self.point[k]
+    def forward(self, Point[::1] rows, Py_ssize_t begin):
+        """Go forward through the rows from `begin` on (D 24)."""
+        cdef Py_ssize_t k
+        for k in range(begin, rows.shape[0]):
+            self.take(&rows[k - 1] if k > 0 else NULL, &rows[k])
+
+    cdef void take(self, const Point* before, Point* now) noexcept nogil:
+        """Go forward to a row from the one before it, if there is one."""
         cdef int i
+        now.last = self.order + (<int>now.derivatives & (ORDERS - 1))
         now.pull = now.certainty = 0.0
-        if k == 0 or now.kind == BEGINS:
-            self.began, self.memory.spread = k, 1.0
+        now.spread = 1.0
+        if before == NULL or now.kind == BEGINS:
             self.begin(now, &self.first[0])
             if self.from_measurement:
                 now.x[0] = now.y
             return
+        now.spread = before.spread
         if not now.h > 0.0:  # no time has passed
-            now.h, now.time = 0.0, self.point[k - 1].time
+            now.h, now.time = 0.0, before.time
             if now.kind == MEASURED:
                 now.kind = UNMEASURED
-        self.predict(&self.point[k - 1], now)
+        self.predict(before, now)
         if now.kind == JUMPS:  # nothing before it matters to z_1, which is y (D 23)
             for i in range(self.n):
                 now.f[0][i] = now.p[0][i] = now.p[i][0] = 0.0
@@ -293,7 +253,10 @@ cdef class Rows:
         """Weigh the sample of a row (D 24); after a jump of d it says of what size (D 34)."""
         cdef int i, j, d = self.order
         cdef double s = now.p[0][0] + now.variance, e = now.y - now.x[0], share
-        cdef double factor = max(fabs(e) / (HUBER * follow_spread(&self.memory, e, sqrt(s))), 1.0)
+        cdef double factor
+        self.memory.spread = now.spread
+        factor = max(fabs(e) / (HUBER * follow_spread(&self.memory, e, sqrt(s))), 1.0)
+        now.spread = self.memory.spread
         if now.derivatives < 0.0 and factor > 1.0:
             for i in range(self.n):
                 share = (e * e - s) * now.f[i][d] / (now.f[0][d] * now.f[0][d])
@@ -309,10 +272,11 @@ cdef class Rows:
     # Back
 
     cdef void go_back(
-        self, Py_ssize_t last, Py_ssize_t end, double doubt, double[:, :, ::1] out
+        self, const Point* rows, Py_ssize_t last, Py_ssize_t begin, Py_ssize_t end, double doubt,
+        double[:, :, ::1] out
     ) noexcept nogil:
         """
-        Write what rows up to `last` say of those before `end` that wait (D 25).
+        Write what rows up to `last` say of those from `begin` to `end` (D 25).
 
         With a `doubt` write x as it would become if all samples were as predicted, but the
         estimates behind row `last` were off by so many standard deviations.
@@ -321,8 +285,8 @@ cdef class Rows:
         cdef double behind[MOST_LEVELS]
         cdef Row known[MOST_LEVELS]  # X of D 34
         cdef Row a[MOST_LEVELS]  # of X <- A X A'
-        cdef Point* now = &self.point[last]
-        cdef double total, size
+        cdef const Point* now = rows + last
+        cdef double total
         cdef Py_ssize_t k
         cdef int i, j, n = self.n
         memset(known, 0, sizeof(known))
@@ -330,8 +294,8 @@ cdef class Rows:
         for i in range(n):
             a[i][i] = 1.0
             costate[i] = doubt / sqrt(now.p[i][i]) if now.p[i][i] > 0.0 else 0.0
-        for k in range(last, self.done - 1, -1):
-            now = &self.point[k]
+        for k in range(last, begin - 1, -1):
+            now = rows + k
             total = 0.0 if doubt > 0.0 else now.pull
             for i in range(n):
                 total += now.certainty * now.p[0][i] * costate[i]
@@ -345,18 +309,16 @@ cdef class Rows:
                 carry(n, a, known)
                 known[0][0] += now.certainty
             if k < end:
-                self.write(now, costate, known, &out[k - self.done, 0, 0])
-            for i in range(n if self.tunes else 0):
-                for j in range(n):
-                    a[j][i] = now.f[i][j]
+                self.write(now, costate, known, &out[k - begin, 0, 0])
             memcpy(behind, costate, n * sizeof(double))
-            size = 0.0
+            total = 0.0
             for j in range(n):
                 costate[j] = 0.0
                 for i in range(n):
+                    a[j][i] = now.f[i][j]
                     costate[j] += now.f[i][j] * behind[i]
-                size += costate[j] + known[j][j]
-            if not isfinite(size):  # nothing is known of what comes later
+                total += costate[j] + known[j][j]
+            if not isfinite(total):  # nothing is known of what comes later
                 memset(costate, 0, sizeof(costate))
                 memset(known, 0, sizeof(known))
 
@@ -376,13 +338,13 @@ cdef class Rows:
             for i in range(n):
                 out[n + i] = max(now.p[i][i] - less[i][i], ROUNDING * fabs(now.p[i][i]))
 
-    def smooth(self, Py_ssize_t end, lag=None):
+    def back(self, Point[::1] rows, Py_ssize_t begin, Py_ssize_t end, lag=None):
         """
-        Return the estimates of the rows before `end` that wait, by all that is known.
+        Return the estimates of the rows from `begin` to `end` that are due, by all that is known.
 
-        With a lag (ns) only those that became so old with the last `append`, by what was known
-        then; a row that begins makes all before it due, which will not be known better. Where
-        numbers overflow they are the observer's.
+        With a lag (ns) these are the ones that are so old, by what was known when they became so
+        old; a row that begins makes all before it due, which will not be known better. Where
+        numbers overflow estimates are the observer's.
 
         Returns
         -------
@@ -390,52 +352,34 @@ cdef class Rows:
             With the variances of their errors, for a self-tuning observer.
 
         """
-        cdef Py_ssize_t first = self.done, due = first, k
+        cdef Py_ssize_t due = begin, done = begin, k
         cdef bint whole = lag is None
         cdef long long age = 0 if whole else lag
-        cdef double[:, :, ::1] out
-        if not first <= end <= self.count:
-            raise ValueError(f'smooth: expected {first} to {self.count}, got {end}')
-        out = np.empty((end - first, 1 + self.tunes, self.n))
-        for k in range(self.count - 1 if whole else self.new, self.count):
+        cdef double[:, :, ::1] out = np.empty((end - begin, 1 + self.tunes, self.n))
+        for k in range(rows.shape[0] - 1 if whole else begin, rows.shape[0]):
             while due < min(end, k + 1) and (
-                whole or self.point[k].time - self.point[due].time >= age
-                or (self.point[k].kind == BEGINS and due < k)
+                whole or rows[k].time - rows[due].time >= age
+                or (rows[k].kind == BEGINS and due < k)
             ):
                 due += 1
-            if due > self.done:
-                self.go_back(k, due, 0.0, out[self.done - first:])
-                self.done = due
-        self.new = self.count
-        found = np.asarray(out)[:due - first]
-        own = self.rows['own'][first:due, :1 + self.tunes, :self.n]
-        if not np.isfinite(found).all():
-            bad = ~np.isfinite(found).all(axis=(1, 2))
-            found[bad] = own[bad]
+            if due > done:
+                self.go_back(&rows[0], k, done, due, 0.0, out[done - begin:])
+                done = due
+        found = np.asarray(out)[:due - begin]
+        bad = ~np.isfinite(found).all(axis=(1, 2))
+        found[bad] = np.asarray(rows)['own'][begin:due, :1 + self.tunes, :self.n][bad]
         return found
 
-    def settled(self):
-        """Return how many rows samples to come can change by `TOLERANCE` at most."""
-        cdef double[:, :, ::1] out = np.empty((self.count - self.done, 1 + self.tunes, self.n))
-        if self.done < self.count:
-            self.go_back(self.count - 1, self.count, 1.0, out)
-        rows = self.rows[self.done:self.count]
-        x, variance = rows['x'][:, :self.n], rows['p'].diagonal(0, 1, 2)[:, :self.n]
-        change, allowed = np.abs(np.asarray(out)[:, 0] - x), TOLERANCE * np.sqrt(np.abs(variance))
-        open_rows = np.flatnonzero((change > allowed + ROUNDING * np.abs(x)).any(axis=1))
-        return self.done + (open_rows[0] if len(open_rows) else len(x))
-
-    def __reduce__(self):
-        numbers = self.done, self.began, self.new, self.memory.spread
-        return Rows, (self.configuration,), (self.rows[:self.count].copy(), *numbers)
-
-    def __setstate__(self, state):
-        self.rows, self.done, self.began, self.new, self.memory.spread = state
-        self.point, self.count = self.rows, len(self.rows)
-        last = self.rows['last']
-        if not (0 <= self.done <= self.count and self.new >= 0 and (last >= self.order).all()
-                and (last < self.n).all()):
-            raise ValueError('smoothing: numbers of rows or levels that can not be')
+    def settled(self, Point[::1] rows, Py_ssize_t begin):
+        """Return up to which row from `begin` on samples to come change `TOLERANCE` at most."""
+        cdef Py_ssize_t count = rows.shape[0]
+        cdef double[:, :, ::1] out = np.empty((count - begin, 1 + self.tunes, self.n))
+        self.go_back(&rows[0], count - 1, begin, count, 1.0, out)
+        waiting = np.asarray(rows)[begin:]
+        x, p = waiting['x'][:, :self.n], waiting['p'].diagonal(0, 1, 2)[:, :self.n]
+        change, allowed = np.abs(np.asarray(out)[:, 0] - x), TOLERANCE * np.sqrt(np.abs(p))
+        is_open = (change > allowed + ROUNDING * np.abs(x)).any(axis=1)
+        return begin + np.argmax(np.append(is_open, True))
 
 
 cdef double usual(const Point* now, int i, int j) noexcept nogil:

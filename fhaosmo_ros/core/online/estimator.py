@@ -14,7 +14,7 @@ from fhaosmo_ros.core.observer.estimates import Estimate, Trajectory, Tuning
 from fhaosmo_ros.core.observer.numbers import checked
 from fhaosmo_ros.core.observer.observer import Observer
 from fhaosmo_ros.core.observer.smoother import Smoother
-from fhaosmo_ros.core.observer.smoothing import Rows
+from fhaosmo_ros.core.observer.smoothing import Passes
 from fhaosmo_ros.core.online.counters import Counters
 from fhaosmo_ros.core.online.events import check_events, EventDetector
 from fhaosmo_ros.core.online.policy import Policy
@@ -447,4 +447,4 @@ def _check_smoothing(p: Mapping[str, Any], configuration: ObserverConfiguration)
             "smoothing, 'predict_to_now': expected estimates of the past or of the present, "
             'got both'
         )
-    Rows(configuration)
+    Passes(configuration)
