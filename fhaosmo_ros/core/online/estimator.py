@@ -228,8 +228,8 @@ class OnlineEstimator:
     def state_dict(self) -> dict[str, Any]:
         """Return all that it remembers, by name, but for counters and parameters; a copy."""
         return {
-            'version': VERSION, **self.observer.structure.state_dict(), **self.policy.memory,
-            **self.events.memory, **{name: x.copy() for name, x in self._arrays.items()},
+            'version': VERSION, **self.observer.structure.state_dict(), **self.events.memory,
+            **self.policy.memory,
         }  # fmt: skip
 
     def load_state_dict(self, values: Mapping[str, Any]) -> None:
@@ -250,28 +250,16 @@ class OnlineEstimator:
         version = checked(values, {'version': VERSION})['version']
         if version != VERSION:
             raise ConfigurationError(f'snapshot: expected version {VERSION}, got {version}')
-        if np.size(values.get('past_pieces', ())) != self.policy.pieces.size:
+        own, events = self.policy.memory, self.events.memory
+        if np.size(values.get('past_pieces', ())) != own['past_pieces'].size:
             raise ConfigurationError(
                 'snapshot: expected that of an estimator with the same measurement_delay'
             )
-        memory, arrays = checked(values, self.policy.memory), self._arrays
-        events, found = checked(values, self.events.memory), checked(values, arrays)
+        own, events = checked(values, own), checked(values, events)
         self.observer.structure.load_state_dict(values)
-        self.policy.change(**memory)
+        self.policy.change(**own)
         self.events.memory = events
-        for name, array in arrays.items():
-            array[:] = found[name]
         self._cut()
-
-    @property
-    def _arrays(self) -> dict[str, NDArray[np.float64]]:
-        """What is remembered of the known inputs."""
-        policy = self.policy
-        return {
-            'u': policy.held_inputs,
-            'past_latest': policy.latest_inputs,
-            'past_pieces': policy.pieces,
-        }
 
     def _cut(self) -> None:
         """Smooth nothing across what has happened."""
@@ -290,7 +278,7 @@ class OnlineEstimator:
     @property
     def inputs(self) -> tuple[float, ...]:
         """The known inputs that are held, in the order of `Observer.inputs`."""
-        return tuple(self.policy.held_inputs.tolist())
+        return tuple(self.policy.arrays['u'].tolist())
 
     def set_input(self, u: float, index: int = 0) -> bool:
         """
@@ -311,7 +299,7 @@ class OnlineEstimator:
         if not math.isfinite(u):
             self.reject_inputs(1)
             return False
-        self.policy.held_inputs[index] = u
+        self.policy.arrays['u'][index] = u
         return True
 
     def reject_inputs(self, count: int) -> None:
@@ -349,7 +337,7 @@ class OnlineEstimator:
         """Do what `update` does, of a stamp of 64 bits, and return only the status word."""
         if self.smoothing is None and not self.events.on:
             return self.policy.advance(stamp, y)  # type: ignore[no-any-return]
-        held = self.policy.held_inputs[np.newaxis]
+        held = self.policy.arrays['u'][np.newaxis]
         self._run(np.array([stamp]), np.array([y], dtype=np.float64), held)
         return self.observer.structure.word  # type: ignore[no-any-return]
 
@@ -387,7 +375,7 @@ class OnlineEstimator:
                 f'run: expected stamps in nanoseconds, which are integers, got {stamps.dtype}'
             )
         stamps, count = stamps.astype(np.int64, copy=False), len(y)
-        held = self.policy.held_inputs
+        held = self.policy.arrays['u']
         inputs = np.tile(held, (count, 1))
         if u is not None:
             inputs = known_inputs(u, self.observer.inputs, count)

@@ -10,7 +10,7 @@ sample needs the inputs that arrived a lag of measurement_delay - input_delay be
 """
 
 from libc.math cimport fabs, fmax, fmin, isfinite, isnan, rint
-from libc.string cimport memcpy
+from libc.string cimport memcpy, memset
 
 from fhaosmo_ros.core.model.prediction cimport MOST_LEVELS
 from fhaosmo_ros.core.observer.self_tuning.observer cimport SelfTuning
@@ -27,9 +27,9 @@ import numpy as np
 cdef double GAP_RATIO = 2.0
 # Bounds what one sample may cost: a few milliseconds.
 cdef int MOST_STEPS = 10_000
-# With max_gap = 0 an interval of more usual ones is a gap; one of more nanoseconds while there
-# is none to compare it with.
-cdef double MOST_INTERVALS = 500.0, FIRST_GAP = 3.6e12
+# With max_gap = 0 a longer time than so many usual intervals ends a run of samples; so long is the
+# usual one (ns) while there is none to compare with.
+cdef double MOST_INTERVALS = 500.0, FIRST_INTERVAL = 7.2e9
 GAP_SAMPLES = MOST_INTERVALS
 cdef double NANOSECONDS = 1e-9
 # Room for so many different values of the inputs within the delay; older ones are forgotten.
@@ -129,30 +129,29 @@ cdef class Policy:
     cdef readonly Course course
     cdef Clock clock
     cdef Sensor sensor
-    # The known inputs of late.
-    cdef readonly object held_inputs  # (m,) array: for the next sample
-    cdef double* held  # its numbers
-    cdef readonly object latest_inputs  # (m,) array: at the latest sample that was used
-    cdef double* present  # its numbers
+    # The known inputs of late: for the next sample; at the latest one that was used; a ring of
+    # pieces of time with the same inputs, each its duration (ns) and these.
+    cdef readonly dict arrays  # by their names in a snapshot
+    cdef double[::1] held, present
+    cdef double[:, ::1] pieces
     cdef double acting[MOST_INPUTS]  # a mean: in the latest step, where y is known later
-    cdef readonly object pieces  # (MOST_PIECES, 1 + m) array of a ring: durations (ns), inputs
-    cdef double* first  # the first piece
 
     def __cinit__(self, Structure structure not None, dict settings):
-        cdef bint late = settings['lag'] > 0
-        cdef double[::1] held = np.zeros(structure.inputs), latest = held.copy()
-        cdef double[:, ::1] pieces = np.zeros((MOST_PIECES * late, 1 + structure.inputs))
-        self.held_inputs, self.held = np.asarray(held), &held[0]
-        self.latest_inputs, self.present = np.asarray(latest), &latest[0]
-        self.pieces = np.asarray(pieces)
-        if late:
-            self.first = &pieces[0, 0]
+        cdef int count = structure.inputs
+        self.arrays = {
+            'u': np.zeros(count), 'past_latest': np.zeros(count),
+            'past_pieces': np.zeros((MOST_PIECES * (settings['lag'] > 0), 1 + count)),
+        }
+        self.held, self.present, self.pieces = self.arrays.values()
         self.configure(structure, settings)
 
     def configure(self, Structure structure not None, dict settings):
         """Go on with an observer that has taken over, and with these settings."""
         cdef Settings new = settings
-        if self.pieces.shape != (MOST_PIECES * (new.lag > 0), 1 + structure.inputs):
+        if (
+            self.pieces.shape[0] != MOST_PIECES * (new.lag > 0)
+            or self.pieces.shape[1] != 1 + structure.inputs
+        ):
             raise ValueError('policy: expected an observer and a past of the same known inputs')
         if self.structure is not None:
             self.structure.enter()
@@ -210,7 +209,7 @@ cdef class Policy:
         elif not word & REJECTED:
             counters.accepted += 1
             course.valid = True
-            memcpy(self.present, u, self.structure.inputs * sizeof(double))
+            memcpy(&self.present[0], u, self.structure.inputs * sizeof(double))
             course.stamp = stamp if self.settings.nominal else now
         elif word & REJECTED_STEP:
             counters.rejected_steps += 1
@@ -225,22 +224,17 @@ cdef class Policy:
 
     cdef int judge(self, long long stamp, long long now, double y) noexcept nogil:
         """Return the flag that says why a sample is not used, whatever the observer is like."""
-        cdef Memory* memory = &self.structure.memory
-        cdef bint held, held_before = self.sensor.holds
         if not fabs(y) <= LIMIT:  # also NaN
             self.counters.rejected_measurements += 1
             return REJECTED_MEASUREMENT
         if stamp == 0 and not self.settings.nominal:
             self.counters.zero_stamps += 1
             return REJECTED_PERIOD
-        if self.settings.stuck_time and self.is_stuck(y - memory.offset, now):
+        if self.settings.stuck_time and self.is_stuck(y - self.structure.memory.offset, now):
             return REJECTED_STUCK
         if self.tuner is None:
             return 0
-        held = self.is_held(y, now)
-        if self.sensor.holds and not held_before:
-            self.tuner.begin_afresh()  # with the sensor's own period
-        if held:
+        if self.is_held(y, now):
             return REPEATED
         return REJECTED_STUCK * self.repeats_noise(y)
 
@@ -294,8 +288,9 @@ cdef class Policy:
             sensor.regular = min(sensor.regular + 1, MOST_REGULAR)
         if sensor.regular == 0:
             sensor.held_for, sensor.holds = sensor.repeats, False
-        elif sensor.regular >= ENOUGH_REGULAR:
+        elif sensor.regular >= ENOUGH_REGULAR and not sensor.holds:
             sensor.holds = True
+            self.tuner.begin_afresh()  # with the sensor's own period
         sensor.repeats, sensor.change = 0, change
         return False
 
@@ -374,7 +369,7 @@ cdef class Policy:
         if elapsed == 0 or again:
             counters.duplicate_stamps += 1
             return 0
-        if -self.max_late() <= elapsed < 0:
+        if -self.longest(course.mean_interval) <= elapsed < 0:
             course.late_count += 1
             if course.late_count > MOST_INTERVALS:  # time does not catch up: a short bag loops
                 course.late_count = 0
@@ -395,7 +390,7 @@ cdef class Policy:
         if not again:  # the rate is not known any more
             course.usual_interval = 0.0
             return 0
-        if 0 < elapsed <= FIRST_GAP:  # the next one like this is none
+        if 0 < elapsed <= MOST_INTERVALS * FIRST_INTERVAL:  # the next one like this is none
             course.usual_interval = max(
                 course.usual_interval, 2.0 * elapsed / MOST_INTERVALS
             )
@@ -405,19 +400,15 @@ cdef class Policy:
 
     cdef long long max_gap(self) noexcept nogil:
         """Return the longest interval that is stepped over (ns)."""
+        return self.longest(self.course.usual_interval or FIRST_INTERVAL)
+
+    cdef long long longest(self, double interval) noexcept nogil:
+        """Return how far apart (ns) two stamps of one run may be, if intervals are such."""
         if self.settings.max_gap > 0:
             return self.settings.max_gap
         if self.settings.nominal:
-            return <long long>(MOST_INTERVALS * self.settings.period)
-        if self.course.usual_interval > 0.0:
-            return <long long>fmin(MOST_INTERVALS * self.course.usual_interval, FAR)
-        return <long long>FIRST_GAP
-
-    cdef long long max_late(self) noexcept nogil:
-        """Return how far back a stamp may lie whose clock has not been set back (ns)."""
-        if self.settings.max_gap > 0 or self.settings.nominal:
-            return self.max_gap()
-        return <long long>fmin(MOST_INTERVALS * self.course.mean_interval, FAR)
+            interval = self.settings.period
+        return <long long>fmin(MOST_INTERVALS * interval, FAR)
 
     cdef int begin_again(self, long long* counter) noexcept nogil:
         """Make a fresh observer, and count it; return flags."""
@@ -455,7 +446,7 @@ cdef class Policy:
         if self.settings.lag == 0:
             return self.step_over(elapsed, y, u)
         self.note(elapsed, u)
-        self.find_acting(elapsed, u)
+        self.find_acting(elapsed)
         word = self.step_over(elapsed, y, self.acting)
         if word & REJECTED_SPIKE:
             self.withdraw(elapsed)
@@ -464,7 +455,7 @@ cdef class Policy:
     cdef double* piece(self, int back) noexcept nogil:
         """Return a piece, by its number from the latest one back."""
         cdef int place = (self.course.past_place + MOST_PIECES - back) % MOST_PIECES
-        return self.first + place * (1 + self.structure.inputs)
+        return &self.pieces[place, 0]
 
     cdef void note(self, long long elapsed, const double* u) noexcept nogil:
         """Append that the inputs have been `u` for the latest `elapsed` nanoseconds."""
@@ -488,35 +479,24 @@ cdef class Policy:
             self.course.past_place = (self.course.past_place + MOST_PIECES - 1) % MOST_PIECES
             self.course.past_count -= 1
 
-    cdef void find_acting(self, long long elapsed, const double* u) noexcept nogil:
-        """
-        Write the mean of the inputs over `elapsed` nanoseconds that ended the lag before now.
-
-        They are `u` where nothing is known of the past.
-        """
-        cdef long long lag = self.settings.lag
-        cdef long long covered = 0, end = 0, begin, share  # end of a piece, before now
-        cdef int k, j
-        cdef double part
+    cdef void find_acting(self, long long elapsed) noexcept nogil:
+        """Write the mean of the inputs over `elapsed` nanoseconds that ended the lag before now."""
+        cdef long long lag = self.settings.lag, covered = 0, age = 0, younger, share
         cdef const double* piece
-        memcpy(self.acting, u, self.structure.inputs * sizeof(double))
+        cdef int k, j
+        memset(self.acting, 0, sizeof(self.acting))
         for k in range(self.course.past_count):
-            piece = self.piece(k)
-            begin = end + <long long>piece[0]
-            share = min(begin, lag + elapsed) - max(end, lag)
+            piece, younger = self.piece(k), age
+            age += <long long>piece[0]
+            share = min(age, lag + elapsed) - max(younger, lag)
             if k == self.course.past_count - 1:  # the oldest one known stands for all before it
                 share = elapsed - covered
             if share > 0:
                 covered += share
-                part = <double>share / covered
                 for j in range(self.structure.inputs):
-                    if part == 1.0:
-                        self.acting[j] = piece[1 + j]
-                    else:
-                        self.acting[j] += part * (piece[1 + j] - self.acting[j])
+                    self.acting[j] += <double>share / covered * (piece[1 + j] - self.acting[j])
             if covered >= elapsed:
                 return
-            end = begin
 
     cdef int step_over(self, long long elapsed, double y, const double* u) noexcept nogil:
         """
@@ -627,32 +607,26 @@ cdef class Policy:
 
     cdef void predict_delay(self) noexcept nogil:
         """Follow the model over the delay, by the inputs that have acted since."""
-        cdef int known = 0, count = self.course.past_count
-        cdef long long lag = self.settings.lag, delay = self.settings.delay
-        cdef long long age = 0, left = lag  # until now: from the end of a piece; to be predicted
-        if lag > 0 and count > 0:
-            while known + 1 < count and age + <long long>self.piece(known)[0] < lag:
-                age += <long long>self.piece(known)[0]
-                known += 1
-            while known >= 0:  # from the oldest piece within the lag to the latest one
-                if left > age:
-                    self.structure.prediction.over(
-                        (left - age) * NANOSECONDS, self.piece(known) + 1
-                    )
-                left = age
-                known -= 1
-                if known >= 0:
-                    age -= <long long>self.piece(known)[0]
+        cdef int count = self.course.past_count, k
+        cdef long long lag = self.settings.lag, delay = self.settings.delay, age = 0, older = lag
+        for k in range(count):
+            age += <long long>self.piece(k)[0]
+        for k in range(count - 1, -1, -1):  # the oldest one known stands for all before it
+            age -= <long long>self.piece(k)[0]
+            if age < older:
+                self.structure.prediction.over((older - age) * NANOSECONDS, self.piece(k) + 1)
+            older = min(age, lag)
+        if count > 0:
             delay -= lag
         if delay > 0:
-            self.structure.prediction.over(delay * NANOSECONDS, self.present)
+            self.structure.prediction.over(delay * NANOSECONDS, &self.present[0])
 
     # What Python calls
 
     def advance(self, long long stamp, double y):
         """Take a sample with the known inputs that are held; return the status word."""
         self.structure.enter()
-        return self.take(stamp, y, self.held)
+        return self.take(stamp, y, &self.held[0])
 
     def run(self, const long long[::1] stamps, const double[::1] y, const double[:, ::1] u):
         """
@@ -719,21 +693,21 @@ cdef class Policy:
 
     @property
     def memory(self):
-        """What it remembers: the members of `Course`, `Clock` and `Sensor` by name."""
-        cdef dict course = self.course, clock = self.clock
-        return course | clock | self.sensor
+        """What it remembers: the members of `Course`, `Clock` and `Sensor`, and arrays, by name."""
+        cdef dict course = self.course, clock = self.clock, sensor = self.sensor
+        return course | clock | sensor | {name: a.copy() for name, a in self.arrays.items()}
 
-    def change(self, **numbers):
-        """Remember other numbers: members of `memory` by name."""
-        cdef dict memory = self.memory | numbers
+    def change(self, **values):
+        """Remember other values: those of `memory` by name."""
+        cdef dict memory = self.memory | values
         self.structure.enter()
         self.course, self.clock, self.sensor = memory, memory, memory
+        for name, array in self.arrays.items():
+            array[:] = memory[name]
 
     def __reduce__(self):
-        state = self.memory, self.counters, self.held_inputs, self.latest_inputs, self.pieces
-        return Policy, (self.structure, self.settings), state
+        return Policy, (self.structure, self.settings), (self.memory, self.counters)
 
     def __setstate__(self, state):
-        memory, self.counters, *arrays = state
-        self.held_inputs[:], self.latest_inputs[:], self.pieces[:] = arrays
+        memory, self.counters = state
         self.change(**memory)
