@@ -16,7 +16,7 @@ from fhaosmo_ros.core.observer.observer import Observer
 from fhaosmo_ros.core.observer.smoother import Smoother
 from fhaosmo_ros.core.observer.smoothing import Passes
 from fhaosmo_ros.core.online.counters import Counters
-from fhaosmo_ros.core.online.events import check_events, EventDetector
+from fhaosmo_ros.core.online.events import check_events, EventDetector, Progress
 from fhaosmo_ros.core.online.policy import Policy
 from fhaosmo_ros.core.online.snapshots import VERSION
 from fhaosmo_ros.core.parameters.declaration import Parameters
@@ -228,7 +228,7 @@ class OnlineEstimator:
     def state_dict(self) -> dict[str, Any]:
         """Return all that it remembers, by name, but for counters and parameters; a copy."""
         return {
-            'version': VERSION, **self.observer.structure.state_dict(), **self.events.memory,
+            'version': VERSION, **self.observer.structure.state_dict(), **vars(self.events.memory),
             **self.policy.memory,
         }  # fmt: skip
 
@@ -250,7 +250,7 @@ class OnlineEstimator:
         version = checked(values, {'version': VERSION})['version']
         if version != VERSION:
             raise ConfigurationError(f'snapshot: expected version {VERSION}, got {version}')
-        own, events = self.policy.memory, self.events.memory
+        own, events = self.policy.memory, vars(self.events.memory)
         if np.size(values.get('past_pieces', ())) != own['past_pieces'].size:
             raise ConfigurationError(
                 'snapshot: expected that of an estimator with the same measurement_delay'
@@ -258,7 +258,7 @@ class OnlineEstimator:
         own, events = checked(values, own), checked(values, events)
         self.observer.structure.load_state_dict(values)
         self.policy.change(**own)
-        self.events.memory = events
+        self.events.memory = Progress(**events)
         self._cut()
 
     def _cut(self) -> None:

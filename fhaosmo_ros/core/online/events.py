@@ -21,6 +21,7 @@ Rejected samples do not count. After a restart nothing is known, so an event end
 
 from collections import deque
 from collections.abc import Mapping
+from dataclasses import dataclass
 import math
 from typing import Any, NamedTuple
 
@@ -31,6 +32,7 @@ from numpy.typing import ArrayLike
 
 SECOND = 1_000_000_000
 LONG = 1e9
+"""Seconds that max_gap = 0 stands for."""
 MOST = 10_000
 """Events that are kept until somebody takes them."""
 GROWTH, QUICKER = 800.0, 4.0
@@ -74,6 +76,18 @@ class Event(NamedTuple):
     sample: int = 0
 
 
+@dataclass
+class Progress:
+    """What a detector remembers, as in snapshots."""
+
+    event: int = FRESH  # what is being done
+    event_since: int = 0  # by the times of samples (ns)
+    event_stamp: int = 0  # the same by their stamps (ns)
+    event_time: int = 0  # of the latest sample (ns)
+    event_mean: float = 0.0  # running mean of d
+    event_deviation: float = 0.0  # that events are judged by
+
+
 class EventDetector:
     """
     Finds events in estimates of d; an `OnlineEstimator` has one.
@@ -93,62 +107,42 @@ class EventDetector:
     latest : Event or None
     count : int
         Events that have begun.
+    memory : Progress
 
     """
 
     def __init__(self, parameters: Mapping[str, Any]) -> None:
         self.waiting: deque[Event] = deque(maxlen=MOST)
         self.latest: Event | None = None
-        self.on, self.count, self._change_time = False, 0, 0.0
-        self._doing = FRESH
-        self._since = self._stamp = self._time = 0
-        self._mean = self._deviation = 0.0
+        self.on, self.count = False, 0
+        self.memory, self._change_time = Progress(), 0
         self.configure(parameters)
-
-    @property
-    def memory(self) -> dict[str, Any]:
-        """
-        What it remembers, for snapshots.
-
-        What is being done; since when, by the times and by the stamps of samples, and the time of
-        the latest one (ns); the running mean of d, and the deviation that events are judged by.
-        """
-        return {
-            'event': self._doing, 'event_since': self._since, 'event_stamp': self._stamp,
-            'event_time': self._time, 'event_mean': self._mean, 'event_deviation': self._deviation,
-        }  # fmt: skip
-
-    @memory.setter
-    def memory(self, values: Mapping[str, Any]) -> None:
-        self._doing, self._since, self._stamp, self._time, self._mean, self._deviation = (
-            values[name] for name in self.memory
-        )
 
     @property
     def active(self) -> bool:
         """True while an event lasts."""
-        return self._doing >= ACTIVE
+        return self.memory.event >= ACTIVE
 
     def configure(self, parameters: Mapping[str, Any]) -> None:
         """Go on with other parameters; an event that lasts ends if none are asked for."""
-        change_time = float(round(parameters['event_change_time'] * SECOND))
+        change_time = round(parameters['event_change_time'] * SECOND)
         if self.on and change_time != self._change_time:
             self.reset()
         self._change_time = change_time
+        self._duration = round(parameters['event_duration'] * SECOND)
+        self._growth = round(parameters['tuning_memory'] * SECOND)
         self._max_gap = round((parameters['max_gap'] or LONG) * SECOND)
         self._threshold, self._deviations, self._release = (
             parameters[f'event_{name}'] for name in ('threshold', 'deviations', 'release')
         )
-        self._duration = round(parameters['event_duration'] * SECOND)
-        self._growth = float(round(parameters['tuning_memory'] * SECOND))
         on = self._threshold > 0.0 or self._deviations > 0.0
         if self.on and not on:
-            self._doing, self.latest = FRESH, None
+            self.memory.event, self.latest = FRESH, None
         self.on = on
 
     def reset(self) -> None:
         """Expect estimates of a fresh observer: what was known of the mean does not count."""
-        self._doing = LOST if self.active else FRESH
+        self.memory.event = LOST if self.active else FRESH
 
     def take(
         self,
@@ -174,11 +168,11 @@ class EventDetector:
             Status words of the samples.
 
         """
-        count = np.size(d)
+        zeros = np.zeros(np.size(d))
         columns = [
             stamps, stamps if times is None else times,
-            np.zeros(count, dtype=np.int64) if words is None else words, d,
-            np.zeros(count) if deviations is None else deviations,
+            zeros.astype(int) if words is None else words, d,
+            zeros if deviations is None else deviations,
         ]  # fmt: skip
         rows = zip(*(np.asarray(column).tolist() for column in columns), strict=True)
         for k, (stamp, time, word, value, deviation) in enumerate(rows):
@@ -186,68 +180,65 @@ class EventDetector:
                 continue
             found = self._judge(stamp, time, word & AFRESH != 0, value, deviation)
             if found is not None:
-                begins, signal, limit = found
                 known = math.nan if deviations is None else deviation
-                self.latest = Event(stamp, begins, self._stamp, signal, limit, known, k)
+                begins = self.memory.event == ACTIVE
+                self.latest = Event(stamp, begins, self.memory.event_stamp, *found, known, k)
                 self.waiting.append(self.latest)
                 self.count += begins
 
     def _judge(
         self, stamp: int, now: int, restarted: bool, d: float, deviation: float
-    ) -> tuple[bool, float, float] | None:
-        """Take an estimate; where an event begins or ends, return if it begins, s and L."""
-        elapsed = now - self._time
-        self._time = now
+    ) -> tuple[float, float] | None:
+        """Take an estimate; where an event begins or ends, return s and L."""
+        m = self.memory
+        elapsed, m.event_time = now - m.event_time, now
         if restarted:
             self.reset()
         elif not 0 <= elapsed <= self._max_gap:  # stamps of another clock: see `adopt`
-            self._since = max(self._since + elapsed, EARLIEST)
+            m.event_since = max(m.event_since + elapsed, EARLIEST)
             elapsed = 0
-        if self._doing == LOST:
-            self._doing = FRESH
-            return False, d, math.inf
-        self._deviation = self._sigma(elapsed, deviation)
-        if self._doing == FRESH:
-            self._since, self._mean = now, d
+        if m.event == LOST:
+            m.event = FRESH
+            return d, math.inf
+        m.event_deviation = self._sigma(elapsed, deviation)
+        if m.event == FRESH:
+            m.event_since, m.event_mean = now, d
             if math.isfinite(deviation):
-                self._doing = LEARNING
-        if self._doing == LEARNING:
-            past = now - self._since
+                m.event = LEARNING
+        if m.event == LEARNING:
+            past = now - m.event_since
             if past > 0:
-                self._mean += min(elapsed, past) / past * (d - self._mean)
+                m.event_mean += min(elapsed, past) / past * (d - m.event_mean)
             if past >= self._change_time:
-                self._doing = QUIET
-        signal = d
-        if self._change_time > 0.0:
-            signal = d - self._mean
-            if self._doing > LEARNING:
-                self._mean -= math.expm1(-elapsed / self._change_time) * signal
-        limit = max(self._threshold, self._deviations * self._deviation)
-        if self._doing == ACTIVE:
-            if abs(signal) > self._release * limit:
+                m.event = QUIET
+        signal = d - m.event_mean if self._change_time > 0 else d
+        if m.event < QUIET:
+            return None
+        if self._change_time > 0:
+            m.event_mean -= math.expm1(-elapsed / self._change_time) * signal
+        limit = max(self._threshold, self._deviations * m.event_deviation)
+        lasts = m.event == ACTIVE
+        if abs(signal) > (self._release * limit if lasts else limit):
+            if m.event == QUIET:
+                m.event, m.event_since, m.event_stamp = BEYOND, now, stamp
+            if lasts or now - m.event_since < self._duration:
                 return None
-            self._doing, self._deviation = QUIET, deviation
-            return False, signal, limit
-        if self._doing < QUIET:
-            return None
-        if not abs(signal) > limit:
-            self._doing = QUIET
-            return None
-        if self._doing == QUIET:
-            self._doing, self._since, self._stamp = BEYOND, now, stamp
-        if now - self._since < self._duration:
-            return None
-        self._doing = ACTIVE
-        return True, signal, limit
+            m.event = ACTIVE
+        else:
+            m.event = QUIET
+            if not lasts:
+                return None
+            m.event_deviation = deviation
+        return signal, limit
 
     def _sigma(self, elapsed: int, deviation: float) -> float:
         """Return the standard deviation that events are judged by from now on."""
-        sigma = self._deviation
-        if self._doing == FRESH or sigma <= 0.0:
+        sigma = self.memory.event_deviation
+        if self.memory.event == FRESH or sigma <= 0.0:
             return deviation
         if deviation > sigma:
-            lag = (self._growth or GROWTH) / (QUICKER if self._doing > QUIET else 1.0)
-            share = elapsed if self._growth > 0.0 else 1.0
+            lag = (self._growth or GROWTH) / (QUICKER if self.memory.event > QUIET else 1.0)
+            share = elapsed if self._growth else 1.0
             sigma *= math.pow(deviation / sigma, -math.expm1(-share / lag))
         return min(sigma, deviation)
 
