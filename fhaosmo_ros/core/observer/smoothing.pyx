@@ -124,11 +124,13 @@ cdef class Passes:
 
     # Forward
 
-    def forward(self, Point[::1] rows, Py_ssize_t begin):
+    def forward(self, rows, Py_ssize_t begin):
         """Go forward through the rows from `begin` on (D 24)."""
+        cdef unsigned char[::1] numbers = rows.view(np.uint8)
+        cdef Point* point = <Point*>&numbers[0]
         cdef Py_ssize_t k
-        for k in range(begin, rows.shape[0]):
-            self.take(&rows[k - 1] if k > 0 else NULL, &rows[k])
+        for k in range(begin, len(rows)):
+            self.take(point + k - 1 if k > 0 else NULL, point + k)
 
     cdef void take(self, const Point* before, Point* now) noexcept nogil:
         """Go forward to a row from the one before it, if there is one."""
@@ -312,10 +314,12 @@ cdef class Passes:
                 self.write(now, costate, known, &out[k - begin, 0, 0])
             memcpy(behind, costate, n * sizeof(double))
             total = 0.0
+            for i in range(n if self.tunes else 0):
+                for j in range(n):
+                    a[j][i] = now.f[i][j]
             for j in range(n):
                 costate[j] = 0.0
                 for i in range(n):
-                    a[j][i] = now.f[i][j]
                     costate[j] += now.f[i][j] * behind[i]
                 total += costate[j] + known[j][j]
             if not isfinite(total):  # nothing is known of what comes later
@@ -338,7 +342,7 @@ cdef class Passes:
             for i in range(n):
                 out[n + i] = max(now.p[i][i] - less[i][i], ROUNDING * fabs(now.p[i][i]))
 
-    def back(self, Point[::1] rows, Py_ssize_t begin, Py_ssize_t end, lag=None):
+    def back(self, rows, Py_ssize_t begin, Py_ssize_t end, lag=None):
         """
         Return the estimates of the rows from `begin` to `end` that are due, by all that is known.
 
@@ -352,30 +356,33 @@ cdef class Passes:
             With the variances of their errors, for a self-tuning observer.
 
         """
-        cdef Py_ssize_t due = begin, done = begin, k
+        cdef unsigned char[::1] numbers = rows.view(np.uint8)
+        cdef const Point* point = <Point*>&numbers[0]
+        cdef Py_ssize_t due = begin, done = begin, count = len(rows), k
         cdef bint whole = lag is None
         cdef long long age = 0 if whole else lag
         cdef double[:, :, ::1] out = np.empty((end - begin, 1 + self.tunes, self.n))
-        for k in range(rows.shape[0] - 1 if whole else begin, rows.shape[0]):
+        for k in range(count - 1 if whole else begin, count):
             while due < min(end, k + 1) and (
-                whole or rows[k].time - rows[due].time >= age
-                or (rows[k].kind == BEGINS and due < k)
+                whole or point[k].time - point[due].time >= age
+                or (point[k].kind == BEGINS and due < k)
             ):
                 due += 1
             if due > done:
-                self.go_back(&rows[0], k, done, due, 0.0, out[done - begin:])
+                self.go_back(point, k, done, due, 0.0, out[done - begin:])
                 done = due
         found = np.asarray(out)[:due - begin]
         bad = ~np.isfinite(found).all(axis=(1, 2))
-        found[bad] = np.asarray(rows)['own'][begin:due, :1 + self.tunes, :self.n][bad]
+        found[bad] = rows['own'][begin:due, :1 + self.tunes, :self.n][bad]
         return found
 
-    def settled(self, Point[::1] rows, Py_ssize_t begin):
+    def settled(self, rows, Py_ssize_t begin):
         """Return up to which row from `begin` on samples to come change `TOLERANCE` at most."""
-        cdef Py_ssize_t count = rows.shape[0]
+        cdef unsigned char[::1] numbers = rows.view(np.uint8)
+        cdef Py_ssize_t count = len(rows)
         cdef double[:, :, ::1] out = np.empty((count - begin, 1 + self.tunes, self.n))
-        self.go_back(&rows[0], count - 1, begin, count, 1.0, out)
-        waiting = np.asarray(rows)[begin:]
+        self.go_back(<Point*>&numbers[0], count - 1, begin, count, 1.0, out)
+        waiting = rows[begin:]
         x, p = waiting['x'][:, :self.n], waiting['p'].diagonal(0, 1, 2)[:, :self.n]
         change, allowed = np.abs(np.asarray(out)[:, 0] - x), TOLERANCE * np.sqrt(np.abs(p))
         is_open = (change > allowed + ROUNDING * np.abs(x)).any(axis=1)

@@ -10,7 +10,7 @@ sample needs the inputs that arrived a lag of measurement_delay - input_delay be
 """
 
 from libc.math cimport fabs, fmax, fmin, isfinite, isnan, rint
-from libc.string cimport memcpy, memset
+from libc.string cimport memcpy
 
 from fhaosmo_ros.core.model.prediction cimport MOST_LEVELS
 from fhaosmo_ros.core.observer.self_tuning.observer cimport SelfTuning
@@ -161,21 +161,8 @@ cdef class Policy:
     # One sample
 
     cdef int take(self, long long stamp, double y, const double* u) noexcept nogil:
-        """
-        Take one sample; return a status word (status.py).
-
-        Parameters
-        ----------
-        stamp : int
-            Nanoseconds.
-        y : float
-            Sample, any number.
-        u : (m,) array
-            Known inputs, finite.
-
-        """
+        """Take any stamp (ns) and y with finite known inputs (m,); return a status word."""
         cdef Course* course = &self.course
-        cdef Counters* counters = &self.counters
         cdef Memory* memory = &self.structure.memory
         cdef long long now = stamp, elapsed = 0
         cdef int word
@@ -183,7 +170,7 @@ cdef class Policy:
             course.now += self.settings.period
             now = course.now
         elif self.settings.by_clock:
-            now = clock_time(&self.clock, stamp, self.max_gap(), &counters.spread_stamps)
+            now = clock_time(&self.clock, stamp, self.max_gap(), &self.counters.spread_stamps)
         word = self.judge(stamp, now, y)
         if not word and not isnan(memory.y):
             elapsed = self.since_latest(now, y, &word)
@@ -191,41 +178,44 @@ cdef class Policy:
             word |= self.step_to(elapsed, y, u)
         elif not word & UNUSED:  # first sample, or first after a restart
             word |= self.structure.start(y)
-            course.latest = self.sensor.changed = self.sensor.seen = now
-            course.timed = True
+            self.begin_time(now, now)
         if elapsed > 0 and not word & REJECTED_SPIKE:
             course.latest = now
             if word & DIVERGED:
-                counters.divergences += 1
                 course.lost = False
             elif self.has_diverged(word & REJECTED_STEP != 0, now):
                 self.refresh()
                 self.structure.level[0].z_hat = memory.y = y
-                counters.divergences += 1
                 word = word & (FLAGS_MASK ^ REJECTED_STEP) | DIVERGED | self.structure.measure(y)
-        if word & REPEATED:  # the estimate stays that of the sample which it repeats
-            counters.accepted += 1
-            word |= self.structure.measure(memory.y)
-        elif not word & REJECTED:
-            counters.accepted += 1
+        if not word & UNUSED:
             course.valid = True
             memcpy(&self.present[0], u, self.structure.inputs * sizeof(double))
             course.stamp = stamp if self.settings.nominal else now
-        elif word & REJECTED_STEP:
-            counters.rejected_steps += 1
-        else:
+        elif not word & REJECTED_STEP:  # the estimate stays that of the latest sample
             if word & JUMPED:  # z_1 has followed y, and only the next sample gives it a time
                 course.valid = False
             word |= self.structure.measure(
                 self.structure.level[0].z_hat if isnan(memory.y) else memory.y
             )
+        self.count(word)
         self.structure.word = word
         return word
+
+    cdef void count(self, int word) noexcept nogil:
+        """Count what has been done to a sample; times are counted where they are judged."""
+        cdef Counters* counters = &self.counters
+        counters.accepted += not word & REJECTED
+        counters.rejected_measurements += word & REJECTED_MEASUREMENT != 0
+        counters.rejected_spikes += word & REJECTED_SPIKE != 0
+        counters.rejected_stuck += word & REJECTED_STUCK != 0
+        counters.rejected_steps += word & REJECTED_STEP != 0
+        counters.gaps += word & GAP != 0
+        counters.jumps += word & JUMPED != 0
+        counters.divergences += word & DIVERGED != 0
 
     cdef int judge(self, long long stamp, long long now, double y) noexcept nogil:
         """Return the flag that says why a sample is not used, whatever the observer is like."""
         if not fabs(y) <= LIMIT:  # also NaN
-            self.counters.rejected_measurements += 1
             return REJECTED_MEASUREMENT
         if stamp == 0 and not self.settings.nominal:
             self.counters.zero_stamps += 1
@@ -241,7 +231,7 @@ cdef class Policy:
     # What a sample tells by itself: its time, and whether y can be true
 
     cdef bint is_stuck(self, double y, long long now) noexcept nogil:
-        """Return True, and count it, if y has been seen unchanged for longer than stuck_time."""
+        """Return True if y has been seen unchanged for longer than stuck_time."""
         cdef Sensor* sensor = &self.sensor
         cdef long long silence = abs(difference(now, sensor.seen))
         sensor.seen = now
@@ -252,7 +242,6 @@ cdef class Policy:
             return False
         self.counters.stuck += not sensor.stuck
         sensor.stuck = True
-        self.counters.rejected_stuck += 1
         return True
 
     cdef bint is_held(self, double y, long long now) noexcept nogil:
@@ -296,7 +285,7 @@ cdef class Policy:
 
     cdef bint repeats_noise(self, double y) noexcept nogil:
         """
-        Return True, and count it, if y repeats itself although it has noise; after `is_held`.
+        Return True if y repeats itself although it has noise; after `is_held`.
 
         The sensor is stuck then, or at the end of its range: that y stands still is no motion.
         Only for self-tuning, which knows whether y has noise, and is not quantised.
@@ -309,18 +298,16 @@ cdef class Policy:
         ):
             sensor.stuck = True
             self.counters.stuck += 1
-        self.counters.rejected_stuck += sensor.stuck
         return sensor.stuck
 
     cdef bint is_spike(self, double innovation) noexcept nogil:
-        """Return True, and count it, if y is too far from its prediction to be believed yet."""
+        """Return True if y is too far from its prediction to be believed yet."""
         cdef bint too_far = not fabs(innovation) <= self.settings.gate
         self.course.spikes = self.course.spikes + 1 if too_far else 0
         if self.course.spikes > MOST_SPIKES:
             self.course.spikes = 0
             self.counters.spikes_believed += 1
             return False
-        self.counters.rejected_spikes += too_far
         return too_far
 
     # Time
@@ -328,8 +315,9 @@ cdef class Policy:
     cdef long long since_latest(self, long long now, double y, int* word) noexcept nogil:
         """Return the time since the latest sample, 0 where there is none; add flags to `word`."""
         cdef long long elapsed
-        if not self.course.timed:
-            self.forget_clock(now)
+        if not self.course.timed:  # the stamp is of another clock: it comes as usual
+            elapsed = <long long>self.course.mean_interval or self.settings.period
+            self.begin_time(now, now - elapsed)
         elapsed = difference(now, self.course.latest)
         if not 0 < elapsed <= self.max_gap():
             return self.settle(now, elapsed, y, word)
@@ -339,7 +327,7 @@ cdef class Policy:
             MOST_INTERVALS * elapsed < self.course.mean_interval
         ):  # the interval that led to the sample before was a gap: begin at that sample
             y = self.structure.memory.y + self.structure.memory.offset
-            word[0] = self.begin_again(&self.counters.restarts_forward)
+            word[0] = self.begin_again(True)
             self.structure.start(y)
         return elapsed
 
@@ -363,7 +351,7 @@ cdef class Policy:
         if self.settings.nominal:
             if 0 < elapsed <= self.settings.period:
                 return elapsed  # nothing was lost: the period itself is longer than max_gap
-            word[0] = self.begin_again(&counters.restarts_forward)
+            word[0] = self.begin_again(True)
             return 0
         word[0] = REJECTED_PERIOD
         if elapsed == 0 or again:
@@ -373,7 +361,7 @@ cdef class Policy:
             course.late_count += 1
             if course.late_count > MOST_INTERVALS:  # time does not catch up: a short bag loops
                 course.late_count = 0
-                word[0] = self.begin_again(&counters.restarts_backward)
+                word[0] = self.begin_again(False)
             else:
                 counters.backward_stamps += 1
             return 0
@@ -384,9 +372,7 @@ cdef class Policy:
             return 0
         follow = difference(now, course.held_stamp)
         again = 0 < follow <= self.max_gap()
-        word[0] = self.begin_again(
-            &counters.restarts_forward if elapsed > 0 else &counters.restarts_backward
-        )
+        word[0] = self.begin_again(elapsed > 0)
         if not again:  # the rate is not known any more
             course.usual_interval = 0.0
             return 0
@@ -410,22 +396,19 @@ cdef class Policy:
             interval = self.settings.period
         return <long long>fmin(MOST_INTERVALS * interval, FAR)
 
-    cdef int begin_again(self, long long* counter) noexcept nogil:
-        """Make a fresh observer, and count it; return flags."""
+    cdef int begin_again(self, bint forward) noexcept nogil:
+        """Make a fresh observer as time has jumped, and count it; return flags."""
         self.refresh()
         self.course.past_count = 0
-        counter[0] += 1
+        self.counters.restarts_forward += forward
+        self.counters.restarts_backward += not forward
         return RESTARTED
 
-    cdef void forget_clock(self, long long now) noexcept nogil:
-        """Let the sample at `now`, of another clock, follow the one before as usual."""
-        cdef Course* course = &self.course
-        course.latest = now - (
-            <long long>course.mean_interval if course.intervals else self.settings.period
-        )
+    cdef void begin_time(self, long long now, long long latest) noexcept nogil:
+        """Begin to count the time of samples at `now`; the latest one was at `latest`."""
+        self.course.latest, self.course.timed = latest, True
+        self.course.held = self.course.lost = False
         self.sensor.changed = self.sensor.seen = now
-        course.held = course.lost = False
-        course.timed = True
 
     cdef void refresh(self) noexcept nogil:
         """Make a fresh observer, whose next sample is the first; a frozen gamma stays."""
@@ -445,11 +428,10 @@ cdef class Policy:
         cdef int word
         if self.settings.lag == 0:
             return self.step_over(elapsed, y, u)
-        self.note(elapsed, u)
-        self.find_acting(elapsed)
+        self.find_acting(elapsed, u)
         word = self.step_over(elapsed, y, self.acting)
-        if word & REJECTED_SPIKE:
-            self.withdraw(elapsed)
+        if not word & REJECTED_SPIKE:
+            self.note(elapsed, u)
         return word
 
     cdef double* piece(self, int back) noexcept nogil:
@@ -472,31 +454,30 @@ cdef class Policy:
             memcpy(latest + 1, u, self.structure.inputs * sizeof(double))
         latest[0] += elapsed
 
-    cdef void withdraw(self, long long elapsed) noexcept nogil:
-        """Take back what `note` has appended last."""
-        self.piece(0)[0] -= elapsed
-        if self.piece(0)[0] <= 0.0:
-            self.course.past_place = (self.course.past_place + MOST_PIECES - 1) % MOST_PIECES
-            self.course.past_count -= 1
+    cdef void find_acting(self, long long elapsed, const double* u) noexcept nogil:
+        """
+        Write the mean of the inputs over `elapsed` nanoseconds that ended the lag before now.
 
-    cdef void find_acting(self, long long elapsed) noexcept nogil:
-        """Write the mean of the inputs over `elapsed` nanoseconds that ended the lag before now."""
-        cdef long long lag = self.settings.lag, covered = 0, age = 0, younger, share
+        They have been `u` for the latest `elapsed` nanoseconds, which are no piece yet.
+        """
+        cdef long long lag = self.settings.lag, age = elapsed, younger, share
+        cdef long long covered = max(elapsed - lag, 0)
         cdef const double* piece
-        cdef int k, j
-        memset(self.acting, 0, sizeof(self.acting))
-        for k in range(self.course.past_count):
+        cdef int count = self.course.past_count, k, j
+        for j in range(self.structure.inputs):
+            self.acting[j] = u[j] if covered > 0 or count == 0 else 0.0
+        for k in range(count):
+            if covered >= elapsed:
+                return
             piece, younger = self.piece(k), age
             age += <long long>piece[0]
             share = min(age, lag + elapsed) - max(younger, lag)
-            if k == self.course.past_count - 1:  # the oldest one known stands for all before it
+            if k == count - 1:  # the oldest one known stands for all before it
                 share = elapsed - covered
             if share > 0:
                 covered += share
                 for j in range(self.structure.inputs):
                     self.acting[j] += <double>share / covered * (piece[1 + j] - self.acting[j])
-            if covered >= elapsed:
-                return
 
     cdef int step_over(self, long long elapsed, double y, const double* u) noexcept nogil:
         """
@@ -506,7 +487,6 @@ cdef class Policy:
         internal estimates, plus a straight line that ends in the new sample. A scheme that
         predicts follows the model by itself, so it takes a gap in one step.
         """
-        cdef Counters* counters = &self.counters
         cdef Memory* memory = &self.structure.memory
         cdef double mean = self.course.mean_interval, corrected = y - memory.offset
         cdef double gamma = memory.gamma, bend = 0.0, h, end, sample
@@ -542,14 +522,11 @@ cdef class Policy:
                 break
             if self.course.frozen:
                 memory.gamma = gamma
-        counters.jumps += word & JUMPED != 0
         if word & REJECTED_SPIKE:  # as if it had not come: the next one is stepped to instead
             memory.pending = 0.0
-            counters.rejected_spikes += 1
             return word
         if is_gap:
-            counters.gaps += 1
-            counters.sub_steps += count
+            self.counters.sub_steps += count
             word |= GAP
         if not word & REJECTED:
             self.update_mean(elapsed)
@@ -592,34 +569,33 @@ cdef class Policy:
         )
 
     cdef void carry(self, double* out) noexcept nogil:
-        """Write z_1 .. z_n and d, (n + 1,), carried over the delay to the present."""
+        """
+        Write z_1 .. z_n and d, (n + 1,), at present.
+
+        The model carries them over the delay, by the inputs that have acted since.
+        """
         cdef double* z = self.structure.prediction.z
-        cdef int i, n = self.structure.order
+        cdef int i, k, n = self.structure.order, count = self.course.past_count, within = 0
+        cdef long long lag = self.settings.lag, delay = self.settings.delay, age = 0, older = lag
         cdef bint finite = True
         for i in range(self.structure.prediction.n):
             z[i], self.structure.prediction.dz[i] = self.structure.estimate(i), 0.0
         memcpy(out, z, (n + 1) * sizeof(double))
-        self.predict_delay()
-        for i in range(n + 1):
-            finite = finite and isfinite(z[i])
-        if finite:  # else the model has left the finite numbers, and the estimates stay
-            memcpy(out, z, (n + 1) * sizeof(double))
-
-    cdef void predict_delay(self) noexcept nogil:
-        """Follow the model over the delay, by the inputs that have acted since."""
-        cdef int count = self.course.past_count, k
-        cdef long long lag = self.settings.lag, delay = self.settings.delay, age = 0, older = lag
-        for k in range(count):
-            age += <long long>self.piece(k)[0]
-        for k in range(count - 1, -1, -1):  # the oldest one known stands for all before it
+        while within < count and age < lag:
+            age += <long long>self.piece(within)[0]
+            within += 1
+        for k in range(within - 1, -1, -1):  # the oldest one known stands for all before it
             age -= <long long>self.piece(k)[0]
-            if age < older:
-                self.structure.prediction.over((older - age) * NANOSECONDS, self.piece(k) + 1)
-            older = min(age, lag)
+            self.structure.prediction.over((older - age) * NANOSECONDS, self.piece(k) + 1)
+            older = age
         if count > 0:
             delay -= lag
         if delay > 0:
             self.structure.prediction.over(delay * NANOSECONDS, &self.present[0])
+        for i in range(n + 1):
+            finite = finite and isfinite(z[i])
+        if finite:  # else the model has left the finite numbers, and the estimates stay
+            memcpy(out, z, (n + 1) * sizeof(double))
 
     # What Python calls
 
@@ -693,7 +669,7 @@ cdef class Policy:
 
     @property
     def memory(self):
-        """What it remembers: the members of `Course`, `Clock` and `Sensor`, and arrays, by name."""
+        """What it remembers by name: members of `Course`, `Clock` and `Sensor`, and arrays."""
         cdef dict course = self.course, clock = self.clock, sensor = self.sensor
         return course | clock | sensor | {name: a.copy() for name, a in self.arrays.items()}
 
