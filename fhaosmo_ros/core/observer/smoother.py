@@ -105,15 +105,15 @@ class Smoother:
         for begin in range(0, len(kept), BLOCK):
             block = slice(begin, begin + BLOCK)
             self._append(found.rows(block), times[block], u[block], kinds[block])
-            early = self._lag is None and self._count <= BEGINNING and self._passes.tunes
-            if not early and self._forward():
-                smoothed.append(self._due())
+            early = self._lag is None and self._passes.tunes and self._count <= BEGINNING
+            if (self._passed or not early) and self._forward():
+                smoothed.append(self._back())
         return self._handed_out(np.concatenate(smoothed))
 
     def finish(self) -> Trajectory:
         """Return the rows that still wait: nothing comes after them."""
-        if self._forward():
-            smoothed = self._back(self._count)
+        if self._count and self._forward():
+            smoothed = self._back(ends=True)
         else:  # the observer knows nothing but y
             smoothed = self._rows['own'][: self._count, :, : self._observer.levels].copy()
             self._done = self._passed = self._count = 0
@@ -184,19 +184,15 @@ class Smoother:
         # d has not jumped at each of them.
         rows['derivatives'][latest != numbers] %= DERIVATIVES + 1
 
-    def _due(self) -> Floats:
-        """Return the estimates that have become final."""
-        end = self._count
-        if self._lag is None:
+    def _back(self, ends: bool = False) -> Floats:
+        """Return the estimates that are due now, or all that wait where the recording ends."""
+        rows, end, lag = self._rows[: self._count], self._count, None if ends else self._lag
+        if lag is None and not ends:
             end = self._done
-            if self._count - end >= self._wait:
-                end = self._passes.settled(self._rows[: self._count], end)
-                self._wait = self._count - end + BLOCK
-        return self._back(end, self._lag)
-
-    def _back(self, end: int, lag: int | None = None) -> Floats:
-        """Go back to the rows before `end` that wait; return the estimates of those due."""
-        found = self._passes.back(self._rows[: self._count], self._done, end, lag)
+            if len(rows) - end >= self._wait:
+                end = self._passes.settled(rows, end)
+                self._wait = len(rows) - end + BLOCK
+        found = self._passes.back(rows, self._done, end, lag)
         self._done += len(found)
         return found  # type: ignore[no-any-return]
 

@@ -91,22 +91,21 @@ cdef class Passes:
     cdef Prediction prediction
     cdef int n, order  # levels; states of the model
     cdef bint from_measurement  # z_1 begins at the first sample
-    cdef double fastest  # rate of the fastest motion of the model (1/s)
+    cdef LinearModel linear  # at rest
     cdef double[::1] first  # estimates of a fresh observer
     cdef double[::1] state_sizes
     cdef double[:, ::1] fresh  # P of a fresh observer with fixed gains
     cdef Memory memory  # a row's own: the size of the innovations (D 21), nothing else
 
     def __cinit__(self, configuration):
-        cdef LinearModel linear
         p, model = configuration.parameters, configuration.model
         self.n, self.order = configuration.levels, model.order
         self.tunes = configuration.self_tuning
         if self.tunes:
-            linear = LinearModel(model.slopes_at_rest + np.eye(self.order, k=1), 0.0)
+            self.linear = LinearModel(model.slopes_at_rest + np.eye(self.order, k=1), 0.0)
         elif p['noise_size'] > 0.0 and p['unknown_input']:
             its = Uncertainty(model, p, configuration.state_sizes)
-            linear, self.fresh = its.linear, its.fresh
+            self.linear, self.fresh = its.linear, its.fresh
             self.model = its.variance, its.intensity, 0.0, self.n - 1 - self.order
         else:
             raise ConfigurationError(
@@ -114,7 +113,7 @@ cdef class Passes:
                 f"`tune` writes it) and 'unknown_input' = true, got {p['noise_size']:g} and "
                 f'{str(p["unknown_input"]).lower()}'
             )
-        self.configuration, self.fastest = configuration, linear.fastest
+        self.configuration = configuration
         self.prediction = Prediction(configuration.expressions, configuration.prediction_step)
         self.from_measurement = self.tunes or p['start_from_measurement']
         self.first, self.state_sizes = configuration.initial_estimate, configuration.state_sizes
@@ -181,7 +180,7 @@ cdef class Passes:
     cdef void predict(self, const Point* before, Point* now) noexcept nogil:
         """Predict a row from the one before (D 24); if that can't be, begin at the observer's."""
         cdef Row slope[MOST_LEVELS]
-        cdef int i, j, n = self.n, count = sub_steps(now.h, max(self.fastest, now.decay))
+        cdef int i, j, n = self.n, count = sub_steps(now.h, max(self.linear.fastest, now.decay))
         cdef bint finite
         memcpy(now.p, before.p, sizeof(now.p))
         memset(now.f, 0, sizeof(now.f))

@@ -134,7 +134,7 @@ cdef class Policy:
     cdef readonly dict arrays  # by their names in a snapshot
     cdef double[::1] held, present
     cdef double[:, ::1] pieces
-    cdef double acting[MOST_INPUTS]  # a mean: in the latest step, where y is known later
+    cdef double acting[MOST_INPUTS]  # in the latest step; a mean where y is known later
 
     def __cinit__(self, Structure structure not None, dict settings):
         cdef int count = structure.inputs
@@ -426,11 +426,12 @@ cdef class Policy:
     cdef int step_to(self, long long elapsed, double y, const double* u) noexcept nogil:
         """Step to a sample with the inputs that acted until it was measured."""
         cdef int word
-        if self.settings.lag == 0:
-            return self.step_over(elapsed, y, u)
-        self.find_acting(elapsed, u)
+        if self.settings.lag > 0:
+            self.find_acting(elapsed, u)
+        else:
+            memcpy(self.acting, u, self.structure.inputs * sizeof(double))
         word = self.step_over(elapsed, y, self.acting)
-        if not word & REJECTED_SPIKE:
+        if self.settings.lag > 0 and not word & REJECTED_SPIKE:
             self.note(elapsed, u)
         return word
 
@@ -609,7 +610,7 @@ cdef class Policy:
         Take K samples; return their record and arrays with a row for each of them.
 
         These are z and d where they are carried to the present (else there are no rows), times of
-        the observer, and the inputs that acted until then.
+        the observer, and the inputs that acted in the latest step until then.
         """
         cdef Structure structure = self.structure
         cdef Py_ssize_t k, count = y.shape[0], m = structure.inputs
@@ -618,7 +619,6 @@ cdef class Policy:
         cdef double[:, ::1] present = np.empty((count * carried, structure.order + 1))
         cdef long long[::1] times = np.empty(count, dtype=np.int64)
         cdef double[:, ::1] acting = np.empty((count, m))
-        cdef const double* inputs
         structure.enter()
         if not (stamps.shape[0] == u.shape[0] == count and u.shape[1] == m):
             raise ValueError('run: arrays of different lengths')
@@ -630,10 +630,7 @@ cdef class Policy:
                     if carried:
                         self.carry(&present[k, 0])
                     times[k] = self.course.latest
-                    inputs = &u[k, 0]
-                    if self.settings.lag > 0:
-                        inputs = self.acting
-                    memcpy(&acting[k, 0], inputs, m * sizeof(double))
+                    memcpy(&acting[k, 0], self.acting, m * sizeof(double))
         finally:
             structure.busy = False
         return record, np.asarray(present), np.asarray(times), np.asarray(acting)
