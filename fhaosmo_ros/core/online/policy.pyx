@@ -313,49 +313,35 @@ cdef class Policy:
     # Time
 
     cdef long long since_latest(self, long long now, double y, int* word) noexcept nogil:
-        """Return the time since the latest sample, 0 where there is none; add flags to `word`."""
-        cdef long long elapsed
-        if not self.course.timed:  # the stamp is of another clock: it comes as usual
-            elapsed = <long long>self.course.mean_interval or self.settings.period
-            self.begin_time(now, now - elapsed)
-        elapsed = difference(now, self.course.latest)
-        if not 0 < elapsed <= self.max_gap():
-            return self.settle(now, elapsed, y, word)
-        self.course.held = False
-        self.course.late_count = 0
-        if self.settings.max_gap == 0 and self.course.intervals == 1 and (
-            MOST_INTERVALS * elapsed < self.course.mean_interval
-        ):  # the interval that led to the sample before was a gap: begin at that sample
-            y = self.structure.memory.y + self.structure.memory.offset
-            word[0] = self.begin_again(True)
-            self.structure.start(y)
-        return elapsed
-
-    cdef long long settle(
-        self, long long now, long long elapsed, double y, int* word
-    ) noexcept nogil:
         """
-        Decide about a sample that does not follow the one before it within max_gap.
+        Return the time (ns) to step over to a sample; add flags to `word`.
 
-        Returns
-        -------
-        int
-            Time to step over. Where it is 0 and no flag rejects, the observer is fresh and the
-            sample is its first.
-
+        Where it is 0 and no flag rejects, the observer is fresh and the sample is its first.
         """
         cdef Course* course = &self.course
-        cdef Counters* counters = &self.counters
-        cdef bint again = course.held and now == course.held_stamp
-        cdef long long follow
+        cdef long long elapsed, follow, longest = self.max_gap()
+        if not course.timed:  # the stamp is of another clock: it comes as usual
+            elapsed = <long long>course.mean_interval or self.settings.period
+            self.begin_time(now, now - elapsed)
+        elapsed = difference(now, course.latest)
+        if self.settings.nominal:  # nothing was lost where the period is longer
+            longest = max(longest, self.settings.period)
+        if 0 < elapsed <= longest:
+            course.held = False
+            course.late_count = 0
+            if self.settings.max_gap == 0 and course.intervals == 1 and (
+                MOST_INTERVALS * elapsed < course.mean_interval
+            ):  # the interval that led to the sample before was a gap: begin at that sample
+                y = self.structure.memory.y + self.structure.memory.offset
+                word[0] = self.begin_again(True)
+                self.structure.start(y)
+            return elapsed
         if self.settings.nominal:
-            if 0 < elapsed <= self.settings.period:
-                return elapsed  # nothing was lost: the period itself is longer than max_gap
             word[0] = self.begin_again(True)
             return 0
         word[0] = REJECTED_PERIOD
-        if elapsed == 0 or again:
-            counters.duplicate_stamps += 1
+        if elapsed == 0 or (course.held and now == course.held_stamp):
+            self.counters.duplicate_stamps += 1
             return 0
         if -self.longest(course.mean_interval) <= elapsed < 0:
             course.late_count += 1
@@ -363,23 +349,20 @@ cdef class Policy:
                 course.late_count = 0
                 word[0] = self.begin_again(False)
             else:
-                counters.backward_stamps += 1
+                self.counters.backward_stamps += 1
             return 0
         if not course.held:
             course.held, course.held_stamp, course.held_y = True, now, y
-            counters.far_stamps += 1
+            self.counters.far_stamps += 1
             word[0] |= HELD
             return 0
-        follow = difference(now, course.held_stamp)
-        again = 0 < follow <= self.max_gap()
         word[0] = self.begin_again(elapsed > 0)
-        if not again:  # the rate is not known any more
+        follow = difference(now, course.held_stamp)
+        if not 0 < follow <= longest:  # the rate is not known any more
             course.usual_interval = 0.0
             return 0
         if 0 < elapsed <= MOST_INTERVALS * FIRST_INTERVAL:  # the next one like this is none
-            course.usual_interval = max(
-                course.usual_interval, 2.0 * elapsed / MOST_INTERVALS
-            )
+            course.usual_interval = max(course.usual_interval, 2.0 * elapsed / MOST_INTERVALS)
         self.structure.start(course.held_y)
         course.latest = self.sensor.changed = course.held_stamp
         return follow
@@ -563,7 +546,6 @@ cdef class Policy:
             return False
         if not course.lost:
             course.lost, course.lost_since = True, now
-            return False
         return (
             self.settings.divergence_time > 0
             and difference(now, course.lost_since) > self.settings.divergence_time
