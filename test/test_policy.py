@@ -315,3 +315,13 @@ def test_reset_keeps_parameters_and_counters_and_forgets_the_rest(from_measureme
         f.sine()
     feed.same(fresh)
     feed.only(rejected_measurements=1)
+
+
+def test_a_value_that_a_slow_sensor_repeats_after_a_reset_has_finite_innovations():
+    feed = Feed(gains='self_tuning', order=2, phi=['0', '-3*z2'])
+    noise = 1e-3 * np.random.default_rng(1).standard_normal(100)
+    y = np.repeat(np.sin(0.01 * np.arange(100)) + noise, 4).tolist()
+    assert feed(*y)[-1] == Status.REPEATED
+    feed.estimator.reset()
+    assert feed(y[-1]) == [Status.REPEATED]
+    np.testing.assert_array_equal(feed.estimator.observer.estimate.innovation, 0.0)
