@@ -41,6 +41,7 @@ cpdef enum Kind:
     UNMEASURED  # a time at which none was used
     JUMPS  # the first sample that was used after a jump of y alone (D 23)
     BEGINS  # the first one of a fresh start
+    OVERFLOWS  # begins at the observer's estimate: numbers have overflowed
 
 
 cdef struct Point:
@@ -48,7 +49,7 @@ cdef struct Point:
     double y  # sample, less its offset (D 23)
     double h  # time since the row before (s)
     long long time  # ns
-    int kind  # MEASURED .. BEGINS
+    int kind  # MEASURED .. OVERFLOWS
     int last  # the level that white noise drives; found by going forward
     double u[MOST_INPUTS]  # known inputs since the row before
     Row own[2]  # the observer's estimates; if it tunes itself, their variances
@@ -138,6 +139,7 @@ cdef class Passes:
         now.pull = now.certainty = 0.0
         now.spread = 1.0
         if before == NULL or now.kind == BEGINS:
+            now.kind = BEGINS
             self.begin(now, &self.first[0])
             if self.from_measurement:
                 now.x[0] = now.y
@@ -159,7 +161,6 @@ cdef class Passes:
         """Begin at a row with an estimate: nothing before it matters."""
         cdef int i, j, d = self.order, chain = now.last - d
         cdef double size
-        now.kind = BEGINS
         memset(now.p, 0, sizeof(now.p))
         memset(now.f, 0, sizeof(now.f))
         memcpy(now.x, x, self.n * sizeof(double))
@@ -201,6 +202,7 @@ cdef class Passes:
                 now.p[i][j] = now.p[j][i] = 0.5 * (now.p[i][j] + now.p[j][i])
             finite = finite and isfinite(now.x[i] * now.x[i]) and isfinite(now.p[i][i])
         if not finite:
+            now.kind = OVERFLOWS
             self.begin(now, now.own[0])
 
     cdef void step(self, Point* now, double h, Row* slope) noexcept nogil:
@@ -364,7 +366,7 @@ cdef class Passes:
         for k in range(count - 1 if whole else begin, count):
             while due < min(end, k + 1) and (
                 whole or point[k].time - point[due].time >= age
-                or (point[k].kind == BEGINS and due < k)
+                or (point[k].kind >= BEGINS and due < k)
             ):
                 due += 1
             if due > done:
