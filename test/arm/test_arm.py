@@ -254,13 +254,14 @@ def hanging(t):
 
 SHAKEN = PERIOD * np.random.default_rng(1).standard_normal(4000)
 LOSSY = T[np.random.default_rng(2).random(4000) > 0.05]
-FASTER = np.where(T < 2.0, T, 2.0 + 0.4 * (T - 2.0))
+FASTER, OTHER = (np.where(T < 2.0, T, 2.0 + share * (T - 2.0)) for share in (0.4, 0.8))
 STAMPS = {
     # When samples were taken, their stamps, and what is counted.
     'jitter': (T, stamped(T, 0.1 * SHAKEN), {}),
     'samples jitter with them': (T + 0.1 * SHAKEN, T + 0.1 * SHAKEN, {}),
     'samples are missing': (LOSSY, stamped(LOSSY, 0.1 * SHAKEN[: len(LOSSY)]), {}),
     'another rate': (FASTER, stamped(FASTER, 0.02 * SHAKEN), {}),
+    'another rate, and jitter': (OTHER, stamped(OTHER, 0.1 * SHAKEN), {}),
     'the driver publishes twice': (np.repeat(T[::2], 2), T, {}),
     'the host hangs, and samples are missing': (LOSSY, hanging(LOSSY), {}),
     'the clock is set forward a little': (T, stamped(T, 0.1 * SHAKEN + 0.02 * (T > 3.5)), {}),

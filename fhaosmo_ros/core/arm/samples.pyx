@@ -10,8 +10,6 @@ import numpy as np
 # later.
 cdef int LONGEST = 200
 cdef double BETTER = 0.8, KEEP = 0.995
-# After so many stamps in a row that are off by half a period or more, the even clock begins anew.
-cdef int GONE = 500
 # The median of so many intervals is the period that the even clock begins with.
 cdef int LEARNT = 20
 # By such a share of a period a stamp has to be late until a sample is taken as missing.
@@ -90,14 +88,14 @@ cdef class Clock:
     A host that hangs stamps one sample late, and those after it at nearly the same time. Where
     stamps and even clock do not agree to half a period, or samples seem to be missing, encoders
     are the third clock: joints move on with their velocity, and how far they have moved tells the
-    time that has passed.
+    time that has passed. Where that is as the stamp says, the even clock begins anew.
     """
 
     cdef readonly bint even  # even intervals are used
     cdef readonly double vague  # share of what has moved at the latest sample that is not known
     cdef double phase  # of the even clock, from the latest stamp (s)
     cdef double period  # s
-    cdef int count, off  # stamps evened out, and those in a row that say nothing
+    cdef int count  # stamps evened out
     cdef list first  # intervals before the even clock begins
     cdef double[:, ::1] speeds  # at the sample before, by stamps and by even intervals
     cdef double rough_by_stamps, rough_by_even
@@ -107,8 +105,8 @@ cdef class Clock:
 
     def reset(self):
         """Forget everything."""
-        self.even, self.vague, self.phase, self.period = False, 0.0, 0.0, 0.0
-        self.count = self.off = 0
+        self.even, self.count = False, 0
+        self.vague = self.phase = self.period = 0.0
         self.first, self.speeds = [], None
         self.rough_by_stamps = self.rough_by_even = 0.0
 
@@ -124,7 +122,6 @@ cdef class Clock:
         cdef double by_stamps = 0.0, by_even = 0.0, total = 0.0, along = 0.0, square = 0.0
         cdef double noise = 0.0, even, one, two
         cdef double told = h, sure = INFINITY  # time by the motion, and how exact it is (s)
-        cdef bint begins
         cdef int k
         for k in range(moved.shape[0]):
             total += moved[k] * moved[k]
@@ -136,23 +133,21 @@ cdef class Clock:
             if total - told * along <= STRAIGHT * noise:
                 sure = sqrt(LARGEST * noise / square)
         even = self.evened(h, told, sure)
-        if fabs(h - even) > 0.5 * self.period:
+        if fabs(h - even) > 0.5 * self.period or (self.count == 0 and sure < h):
             self.speeds = None
             if fabs(h - told) < fabs(even - told):
                 even = h
             self.vague = fabs(even - told) / fmax(fabs(told), 1e-15)
             return even
-        begins = self.speeds is None
-        if begins:
-            self.speeds = np.zeros((2, moved.shape[0]))
+        if self.speeds is None:
+            self.speeds = np.array([np.divide(moved, h), np.divide(moved, even)])
         for k in range(moved.shape[0]):
             one, two = moved[k] / h, moved[k] / even
             by_stamps += (one - self.speeds[0, k]) * (one - self.speeds[0, k])
             by_even += (two - self.speeds[1, k]) * (two - self.speeds[1, k])
             self.speeds[0, k], self.speeds[1, k] = one, two
-        if not begins:
-            self.rough_by_stamps = KEEP * self.rough_by_stamps + by_stamps
-            self.rough_by_even = KEEP * self.rough_by_even + by_even
+        self.rough_by_stamps = KEEP * self.rough_by_stamps + by_stamps
+        self.rough_by_even = KEEP * self.rough_by_even + by_even
         self.even = self.rough_by_even < BETTER * self.rough_by_stamps
         one = even if self.even else h
         self.vague = fabs(h - even) / one
@@ -166,8 +161,7 @@ cdef class Clock:
             self.first.append(h)
             if len(self.first) == LEARNT:
                 self.period, self.phase = float(np.median(self.first)), 0.0
-                self.count = LEARNT // 2
-                self.first.clear()
+                self.count, self.first = LEARNT // 2, []
             return h
         steps = max(1, int(since / self.period + 1.0 - MISSING))
         off = since - steps * self.period
@@ -177,19 +171,17 @@ cdef class Clock:
         ):
             steps = max(1, <int> (fmin(told, since) / self.period + 0.5))
             off = since - steps * self.period
-        if fabs(off) > 0.5 * self.period:  # a stamp that says nothing, unless it goes on
-            self.off += 1
-            if self.off > GONE:
-                self.count = self.off = 0
-            self.phase = 0.0 if fabs(h - steps * self.period) < 0.5 * self.period else -off
-            return steps * self.period
-        self.off = 0
+        if fabs(off) > 0.5 * self.period:  # says nothing, unless joints have moved as it says
+            even = steps * self.period
+            self.phase = 0.0 if fabs(h - even) < 0.5 * self.period else -off
+            if fabs(h - told) < fabs(even - told):
+                self.count = 0
+            return even
         self.count = n = min(self.count + 1, LONGEST)
         even = steps * self.period + 2.0 * (2.0 * n - 1.0) / (n * (n + 1.0)) * off
         self.phase = even - since
         self.period += 6.0 / (n * (n + 1.0)) * off / steps
         return even
-
 
 cdef class Samples:
     """
@@ -260,13 +252,9 @@ cdef class Samples:
                     return i
         return -1
 
-    def is_possible(self, const double[::1] velocity):
+    def is_possible(self, velocity):
         """Return False where a joint, of (n,), is faster than any, or not finite."""
-        cdef int k
-        cdef bint possible = velocity.shape[0] == self.step.shape[0]
-        for k in range(velocity.shape[0] if possible else 0):
-            possible = possible and fabs(velocity[k]) < self.highest[2, k]
-        return possible
+        return bool(np.all(np.abs(velocity) < self.highest[2]))
 
     cdef double shorter(self, int k, double moved) noexcept:
         """Return how far a joint has moved; one without an end has gone the shorter way."""
