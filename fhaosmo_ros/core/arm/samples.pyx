@@ -252,9 +252,13 @@ cdef class Samples:
                     return i
         return -1
 
-    def is_possible(self, velocity):
+    def is_possible(self, const double[::1] velocity):
         """Return False where a joint, of (n,), is faster than any, or not finite."""
-        return bool(np.all(np.abs(velocity) < self.highest[2]))
+        cdef int k
+        cdef bint possible = velocity.shape[0] == self.step.shape[0]
+        for k in range(velocity.shape[0] if possible else 0):
+            possible = possible and fabs(velocity[k]) < self.highest[2, k]
+        return possible
 
     cdef double shorter(self, int k, double moved) noexcept:
         """Return how far a joint has moved; one without an end has gone the shorter way."""
