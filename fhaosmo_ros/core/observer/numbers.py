@@ -62,9 +62,10 @@ def array_of(
     most: float = LARGEST,
 ) -> NDArray[np.float64]:
     """Return an array of that shape whose numbers are within that range; raise as `checked`."""
-    nothing = np.zeros(shape) if 0 in shape else 'nothing'  # an empty array has no entries
-    number = values.get(name, nothing)
     what = f'finite numbers of shape {shape}' if shape else 'a number'
+    if name not in values and 0 not in shape:  # an empty array has no entries
+        raise _refused(name, what, 'none of that name')
+    number = values.get(name, np.zeros(shape))
     try:
         array = np.asarray(number, dtype=np.float64)
     except (OverflowError, TypeError, ValueError):
