@@ -16,7 +16,7 @@ from fhaosmo_ros.core.observer.self_tuning.members cimport (
 )
 from fhaosmo_ros.core.observer.self_tuning.normal cimport exponential, mills
 from fhaosmo_ros.core.vectors cimport VECTORISED
-from fhaosmo_ros.core.observer.self_tuning.weights cimport QUANTISED_FLOOR
+from fhaosmo_ros.core.observer.self_tuning.weights cimport FLOOR
 from fhaosmo_ros.core.observer.structure cimport GATE
 
 cdef double ROOT = sqrt(2.0 * M_PI)
@@ -199,7 +199,7 @@ cdef bint choose_members(Members* m, double quanta) noexcept nogil:
     m.shared.active = HALF if quanta > 0.0 else COUNT
     if m.shared.active < before:
         for g in range(HALF, COUNT):
-            m.weight[g], m.score[g] = 0.0, -QUANTISED_FLOOR
+            m.weight[g], m.score[g] = 0.0, -FLOOR
     elif m.shared.active > before:
         m.shared.unsettled = 0.0
         for i in range(COLOURS):

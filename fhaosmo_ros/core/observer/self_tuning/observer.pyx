@@ -22,7 +22,7 @@ from fhaosmo_ros.core.observer.self_tuning.noise cimport (
 )
 from fhaosmo_ros.core.observer.self_tuning.start cimport gather
 from fhaosmo_ros.core.observer.self_tuning.weights cimport (
-    FLOOR, Model, QUANTISED_FLOOR, judge, mix, tell_model, weigh
+    Model, judge, mix, tell_model, weigh
 )
 from fhaosmo_ros.core.observer.status cimport JUMPED
 from fhaosmo_ros.core.observer.structure cimport (
@@ -224,7 +224,7 @@ cdef class SelfTuning(Structure):
         cdef int i, since_jump = 0
         sample.quanta = rounding(m)
         if choose_members(m, sample.quanta):
-            weigh(m, FLOOR)
+            weigh(m)
         follow_differences(m, y)
         follow_stamps(m, h, memory.beyond > 0.0)
         same = fabs(h - shared.flow_period) <= EXACT * shared.flow_period
@@ -285,7 +285,7 @@ cdef class SelfTuning(Structure):
         if since_jump > 2:  # two outliers are no jump
             follow_jump(m, since_jump)
             self.y_jumped = True
-            weigh(m, FLOOR)
+            weigh(m)
         mix(m, self.slider, mean, self.trial_variances)
         for i in range(self.levels):
             self.trial[i].z_hat = mean[i]
@@ -384,7 +384,7 @@ cdef class SelfTuning(Structure):
         if not quantised:
             judge(m, sample.grown, kept)
         correct_states(m, sample.y)
-        weigh(m, QUANTISED_FLOOR if quantised else FLOOR)
+        weigh(m)
 
     # Snapshots and copies
 

@@ -13,7 +13,7 @@ from fhaosmo_ros.core.observer.self_tuning.members cimport (
 from fhaosmo_ros.core.observer.self_tuning.noise cimport (
     LATTICE_SHARE, ROUNDED, divided, follow_differences, is_multiple
 )
-from fhaosmo_ros.core.observer.self_tuning.weights cimport FLOOR, weigh
+from fhaosmo_ros.core.observer.self_tuning.weights cimport weigh
 
 cdef double LEAST = 1e-150  # noise: its square is not 0
 cdef double MEDIAN = 0.6745  # of |x| where x is normal with variance 1
@@ -201,6 +201,6 @@ cdef void begin(Members* m, double noise) noexcept nogil:
         m.score[g] = m.prior[g]
         m.variance[g] = m.short_mean[g] = 1.0
         m.log_variance[g] = m.residual[g] = m.far[g] = 0.0
-    weigh(m, FLOOR)
+    weigh(m)
     shared.told = shared.likeliest
     watch(m, shared.told)

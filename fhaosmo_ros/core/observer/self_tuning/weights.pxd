@@ -13,9 +13,9 @@ cdef struct Model:
     double derivatives  # k; k - 4 where d has jumped (D 33)
 
 
-cdef double FLOOR, QUANTISED_FLOOR
+cdef double FLOOR
 
 cdef VECTORISED judge(Members* m, double grown, double kept) noexcept nogil
-cdef VECTORISED weigh(Members* m, double floor) noexcept nogil
+cdef VECTORISED weigh(Members* m) noexcept nogil
 cdef VECTORISED mix(Members* m, double slider, double* mean, double* variances) noexcept nogil
 cdef void tell_model(Members* m, double slider, bint jumped, Model* model) noexcept nogil

@@ -15,7 +15,7 @@ from fhaosmo_ros.core.observer.structure cimport GATE
 # No log-likelihood falls further below the best one (D 28, D 31), but by what the member's prior
 # is below that of the likeliest: a larger d needs more reason to be believed.
 # One that is FLOOR below has no weight.
-cdef double FLOOR = 30.0, QUANTISED_FLOOR = 100.0
+cdef double FLOOR = 30.0
 
 
 cdef VECTORISED judge(Members* m, double grown, double kept) noexcept nogil:
@@ -50,7 +50,7 @@ cdef VECTORISED judge(Members* m, double grown, double kept) noexcept nogil:
             w.b[g] = limit if w.b[g] > limit else -limit if w.b[g] < -limit else w.b[g]
 
 
-cdef VECTORISED weigh(Members* m, double floor) noexcept nogil:
+cdef VECTORISED weigh(Members* m) noexcept nogil:
     """Turn log-likelihoods into weights (D 28), and say which member is the likeliest."""
     cdef Py_ssize_t g, active = m.shared.active, likeliest = 0
     cdef double best = largest(m.score, active), total = 0.0, usual, score, least
@@ -59,7 +59,7 @@ cdef VECTORISED weigh(Members* m, double floor) noexcept nogil:
     m.shared.likeliest, usual = <int>likeliest, m.prior[likeliest]
     for g in range(active):
         score, least = m.score[g] - best, m.prior[g] - usual
-        least = (least if least < 0.0 else 0.0) - floor
+        least = (least if least < 0.0 else 0.0) - FLOOR
         m.score[g] = score if score > least else least
         m.weight[g] = 0.0
     for g in range(active):
