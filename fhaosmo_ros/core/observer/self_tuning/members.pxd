@@ -59,7 +59,6 @@ cdef struct Sample:
     double largest  # variance of the innovations with which a member can judge it
     double average  # number of samples to average the noise over
     double kept  # part of the log-likelihoods that is not forgotten
-    double grown  # how much larger than expected innovations and differences are of late, >= 1
 
 
 cdef struct Work:
@@ -102,6 +101,7 @@ cdef struct Shared:
     double flow_period  # interval that the flow is that of (s)
     double first_noise  # variance of the noise when the members began
     double roughness  # short mean of the squared differences of y, over their usual size
+    double grown  # how much larger than expected innovations and differences are of late, >= 1
     double interval  # last one between two samples, taken or not (s)
     double since  # time from the last sample taken to the last one (s)
     double jitter  # variance that the intervals of late say the stamps have at most (s^2)

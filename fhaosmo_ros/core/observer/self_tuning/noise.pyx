@@ -26,8 +26,8 @@ cdef double CLIPPED = 1.0 - HUBER * sqrt(M_2_PI) * exp(-0.5 * HUBER * HUBER) / e
 cdef double FADED = 8.0
 cdef double SHORT_SHARE = 1.0 / LOST_SAMPLES  # of the last sample in short means
 # If squared innovations over S are so much larger of late for every member that can judge, and
-# squared differences of y are too, the noise has grown: it is averaged over QUICK_SAMPLES then, as
-# are the steps of y. P is not the steady one if noise or the mean interval has changed so much.
+# squared differences of y are too, the noise has grown: both are averaged over QUICK_SAMPLES then.
+# The steps of y always are. P is not the steady one if noise or the mean interval has changed so.
 cdef double STEADY = 1.5, QUICK_SAMPLES = 40.0
 # With a larger share of multiples of the quantum among the steps of y it is quantised.
 cdef double LATTICE_SHARE = 0.9
@@ -102,8 +102,10 @@ cdef void follow_differences(Members* m, double y) noexcept nogil:
     """
     cdef Sample* sample = &m.work.sample
     cdef double value = y, binomial = 1.0, least = ROUNDED * m.shared.first_noise
-    cdef double bound = INFINITY, before, value_before, white, r, grown
+    cdef double bound = INFINITY, before, value_before, white, r, grown, average = ROUGH_SAMPLES
     cdef int p, c
+    if m.shared.grown > STEADY:
+        average = QUICK_SAMPLES
     sample.roughness, sample.roughness_before = 0.0, m.shared.roughness
     for p in range(m.n + 2):
         before, value_before = m.difference[p], value
@@ -119,7 +121,7 @@ cdef void follow_differences(Members* m, double y) noexcept nogil:
                 sample.uneven = white * white / binomial
                 if m.rough[0][p] < bound:
                     bound, sample.roughness = m.rough[0][p], r
-            grown = 1.0 + (fmin(r, HUBER * HUBER) / CLIPPED - 1.0) / ROUGH_SAMPLES
+            grown = 1.0 + (fmin(r, HUBER * HUBER) / CLIPPED - 1.0) / average
             m.rough[c][p] = fmax(m.rough[c][p] * grown, least)
     m.shared.roughness += SHORT_SHARE * (
         fmin(sample.roughness, HUBER * HUBER) - m.shared.roughness
@@ -197,7 +199,7 @@ cdef VECTORISED follow_noise(Members* m) noexcept nogil:
     """
     Follow the noise of y of each colour, by the innovations of its likeliest members (D 29).
 
-    In the sample, `grown` is how much larger than expected squared innovations have been of late,
+    `grown` is how much larger than expected squared innovations have been of late,
     for every member, and squared differences too: more than 1 while the noise grows.
     """
     cdef Work* w = &m.work
@@ -217,7 +219,7 @@ cdef VECTORISED follow_noise(Members* m) noexcept nogil:
         w.ratio[g] = ratio
         w.one[g] = -m.short_mean[g] if variance <= widest else -INFINITY
     least = fmin(m.shared.roughness, -largest(w.one, active))
-    sample.grown = fmax(least, 1.0)
+    m.shared.grown = fmax(least, 1.0)
     for c in range(COLOURS):
         best[c], weights[c], squares[c] = -INFINITY, 0.0, 0.0
     best[0] = largest(m.score, HALF)

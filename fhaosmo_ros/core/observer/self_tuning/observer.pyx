@@ -382,7 +382,7 @@ cdef class SelfTuning(Structure):
             take_interval(m, kept)
         correct(m, quantised)
         if not quantised:
-            judge(m, sample.grown, kept)
+            judge(m, m.shared.grown, kept)
         correct_states(m, sample.y)
         weigh(m)
 
