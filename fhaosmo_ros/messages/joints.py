@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a sensor_msgs/msg/JointState, live or of a bag, says of the joints of an arm."""
 
+from functools import lru_cache
 from typing import Any
 
 from fhaosmo_ros.core.arm.arm import Arm
@@ -14,14 +15,14 @@ def joint_sample(message: Any, arm: Arm) -> tuple[int, list[NDArray[np.float64]]
     """
     Return what `Arm.take` needs: the stamp in ns, and position, effort and perhaps velocity.
 
-    Raise ConfigurationError where a joint, a number or the stamp is missing.
+    Raises
+    ------
+    ConfigurationError
+        A joint, a number or the stamp is missing.
+
     """
-    names, arrays = list(message.name), []
-    if missing := [name for name in arm.joints if name not in names]:
-        raise ConfigurationError(
-            f'a message lacks {", ".join(missing)}{suggestion(missing[0], names)}'
-        )
-    order = [names.index(name) for name in arm.joints]
+    names = tuple(message.name)
+    order, arrays = _order(names, arm.joints), []
     measured = ['velocity'] * (arm.parameters['measurement'] == 'velocity')
     for what in ('position', 'effort', *measured):
         numbers = getattr(message, what)
@@ -34,3 +35,13 @@ def joint_sample(message: Any, arm: Arm) -> tuple[int, list[NDArray[np.float64]]
     if stamp == 0:
         raise ConfigurationError('the header stamp is 0: nobody fills it')
     return stamp, arrays
+
+
+@lru_cache(maxsize=16)  # messages of a driver have the same names
+def _order(names: tuple[str, ...], joints: tuple[str, ...]) -> list[int]:
+    """Return where each joint is among the names."""
+    if missing := [name for name in joints if name not in names]:
+        raise ConfigurationError(
+            f'a message lacks {", ".join(missing)}{suggestion(missing[0], names)}'
+        )
+    return [names.index(name) for name in joints]

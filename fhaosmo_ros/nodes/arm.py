@@ -39,6 +39,8 @@ FIELDS = {
 TOPICS = dict.fromkeys(FIELDS, JointState) | {
     'external_wrench': WrenchStamped, 'event': DiagnosticArray
 }  # fmt: skip
+KIND = 15
+"""So many first letters of a text tell its kind: names and numbers, which may change, follow."""
 SERVICES = {
     'reset': 'the estimates begin anew with the next sample',
     'tare': 'the present external torque counts as zero',
@@ -197,7 +199,7 @@ class ArmNode(TimedNode):
 
     def _warn(self, text: str) -> None:
         """Log a problem, each kind at most every `QUIET` seconds, and report it."""
-        now, kind = perf_counter(), text[:15]  # without names and numbers, which may change
+        now, kind = perf_counter(), text[:KIND]
         if now - self._logged.get(kind, -np.inf) > QUIET:
             self._logged[kind] = now
             self.get_logger().warning(text)

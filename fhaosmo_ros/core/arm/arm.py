@@ -303,7 +303,8 @@ class Arm:
             bank.start(mass, drive, mass @ speed, spread, self._model_variance)
         if self._velocity is None or not self._of_position:
             self._velocity = self._sliding = speed.copy()
-        self._sliding = self._sliding - np.expm1(-h / SLIDING) * (speed - self._sliding)
+        elif self._calibrated:
+            self._sliding = self._sliding - np.expm1(-h / SLIDING) * (speed - self._sliding)
         mass, drive = self._drive(q, self._velocity, torque, self._sliding)
         bank.step(
             h, mass, samples.change, self._variance, samples.vague, drive,
@@ -362,7 +363,11 @@ class Arm:
         """
         Estimate from arrays: t (K,) in s, q, effort and velocity (K, n).
 
-        Raise ConfigurationError for arrays of other sizes.
+        Raises
+        ------
+        ConfigurationError
+            Arrays of other sizes.
+
         """
         stamps = np.round(np.asarray(t, dtype=np.float64) * 1e9).astype(np.int64)
         shape = len(stamps), len(self.joints)
@@ -383,9 +388,19 @@ class Arm:
         """
         Return the wrench at the origin of a frame that would make the estimated torque.
 
-        Force (3,) in N and torque (3,) in N m along the frame's axes, as one array, and True if
-        part of it cannot be seen in this posture. Damped least squares, weighted by the covariance
-        of the torque. Raise ConfigurationError for an unknown frame.
+        Damped least squares, weighted by the covariance of the torque.
+
+        Returns
+        -------
+        (6,) array, bool
+            Force in N and torque in N m along the frame's axes; True if part of them cannot be
+            seen in this posture.
+
+        Raises
+        ------
+        ConfigurationError
+            An unknown frame.
+
         """
         jacobian = self.model.frame_jacobian(estimate.position, frame)
         root = np.linalg.cholesky(estimate.covariance)
