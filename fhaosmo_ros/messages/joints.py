@@ -38,10 +38,10 @@ def joint_sample(message: Any, arm: Arm) -> tuple[int, list[NDArray[np.float64]]
 
 
 @lru_cache(maxsize=16)  # messages of a driver have the same names
-def _order(names: tuple[str, ...], joints: tuple[str, ...]) -> list[int]:
+def _order(names: tuple[str, ...], joints: tuple[str, ...]) -> NDArray[np.intp]:
     """Return where each joint is among the names."""
     if missing := [name for name in joints if name not in names]:
         raise ConfigurationError(
             f'a message lacks {", ".join(missing)}{suggestion(missing[0], names)}'
         )
-    return [names.index(name) for name in joints]
+    return np.array([names.index(name) for name in joints])
