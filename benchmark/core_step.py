@@ -25,7 +25,7 @@ import numpy as np
 from results import Row
 from studies.harness import model_alone, observed, SELF_TUNING
 
-PERIOD = 1e-3
+PERIOD, BLOCK = 1e-3, 10_000  # seconds; samples that are recorded at a time, here and in C
 CASE = {'variant': 'fuzzy_adaptive', 'scheme': 'explicit', 'fuzzy_widths': [0.1]}
 """Wide fuzzy sets: no chatter, so that rounding does not grow and both end at the same state."""
 BAR, CALL_BAR = 1.1, 0.6  # times C; microseconds of a call of `Observer.step`
@@ -59,12 +59,12 @@ def measure(quick: bool) -> list[Row]:
 def in_core(parameters: dict[str, Any], y: np.ndarray) -> Callable[[], np.ndarray]:
     """Return a callable that steps through y[1:] by the loop behind `Observer.run`."""
     observer, rest = _started(parameters, y[0]), np.ascontiguousarray(y[1:])
-    start, count = observer.structure.state_dict(), len(rest)
-    h, u = np.full(count, PERIOD), np.zeros((count, 1))
+    start, h, u = observer.structure.state_dict(), np.full(BLOCK, PERIOD), np.zeros((BLOCK, 1))
 
     def run() -> np.ndarray:
         observer.structure.load_state_dict(start)
-        run_structure(observer.structure, rest, h, u)
+        for y in rest.reshape(-1, BLOCK):
+            run_structure(observer.structure, y, h, u)
         return _numbers(observer)
 
     return run
@@ -78,18 +78,19 @@ def in_c(folder: Path, y: np.ndarray) -> Callable[[], np.ndarray]:
     law = np.array(
         [*gains, c.epsilon, c.gamma_initial, *(c.parameters[f'gamma_{n}'] for n in LAW)]
     )
-    start, rest, eps = _numbers(_started(CASE, y[0])), np.ascontiguousarray(y[1:]), np.empty(4)
+    start, rest = _numbers(_started(CASE, y[0])), np.ascontiguousarray(y[1:])
     library = folder / 'reference.so'
     options = ['-O3', '-shared', '-fPIC', f'-DLEVEL_SHIFT={LEVEL_SHIFT}', '-o', library]
     command = [*shlex.split(os.environ.get('CC', 'cc')), *options]
     subprocess.run([*command, Path(__file__).with_name('reference.c'), '-lm'], check=True)
     function = ctypes.CDLL(str(library)).run
-    period, count = ctypes.c_double(PERIOD), ctypes.c_long(len(rest))
+    period, count = ctypes.c_double(PERIOD), ctypes.c_long(BLOCK)
 
     def run() -> np.ndarray:
-        state = start.copy()
-        at = [x.ctypes.data_as(ctypes.c_void_p) for x in (law, state, rest, eps)]
-        function(*at[:3], period, count, at[3])
+        state, record = start.copy(), np.empty((BLOCK, 19))
+        for y in rest.reshape(-1, BLOCK):
+            at = [x.ctypes.data_as(ctypes.c_void_p) for x in (law, state, y, record)]
+            function(*at[:3], period, count, at[3])
         return state
 
     return run

@@ -7,6 +7,7 @@
  * State: z_hat[4], z_tilde[4], p[4], q[4], gamma, y, pending: PARTS in core_step.py.
  */
 #include <math.h>
+#include <string.h>
 
 enum { N = 4, SIZE = 4 * N + 3, KNOTS = 193 };
 
@@ -102,10 +103,17 @@ static int step(const struct law *law, double *state, double y, double h, double
 }
 
 /* Step through `count` samples of period `h`; `eps` and the last status word are the result. */
-int run(const struct law *law, double *state, const double *y, double h, long count, double *eps)
+/* `record` has a row of 19 numbers a sample, as many as the core records. */
+int run(const struct law *law, double *state, const double *y, double h, long count, double *record)
 {
     int word = 0;
-    for (long k = 0; k < count; k++)
-        word = step(law, state, y[k], h, eps);
+    for (long k = 0; k < count; k++, record += 19) {
+        word = step(law, state, y[k], h, record + 8);
+        memcpy(record, state, 8 * sizeof(double));
+        memcpy(record + 12, state, 4 * sizeof(double));
+        record[16] = state[16];
+        record[17] = word & ((1 << LEVEL_SHIFT) - 1);
+        record[18] = word >> LEVEL_SHIFT;
+    }
     return word;
 }

@@ -5,6 +5,7 @@ What every observer remembers, and the step that all of them share.
 Equations are cited as P (paper: label of the equation) and D (number in docs/mathematics.md).
 """
 
+from cython cimport final
 from libc.math cimport INFINITY, NAN, fabs, isfinite, isnan, sqrt
 from libc.string cimport memset
 
@@ -183,6 +184,7 @@ cdef class Structure:
             self.prediction.z[i] = self.level[i - 1].z_tilde if i > 0 else self.memory.y
             self.prediction.dz[i] = 0.0
 
+    @final
     cdef double estimate(self, int i) noexcept nogil:
         """Return the estimate of z_{i+1}, or of d for i = n, or of its derivatives behind it."""
         if i > 0 and (self.internal or i >= self.levels):
@@ -412,12 +414,15 @@ cdef class Record:
     cdef void write(self, Structure structure, Py_ssize_t row, int word) noexcept nogil:
         """Record what an observer knows."""
         cdef int i
+        cdef double* z = &self.z[row, 0]
+        cdef double* z_hat = &self.z_hat[row, 0]
+        cdef double* z_tilde = &self.z_tilde[row, 0]
+        cdef double* innovation = &self.innovation[row, 0]
         for i in range(structure.levels):
-            self.z_hat[row, i] = structure.level[i].z_hat
-            self.z_tilde[row, i] = structure.level[i].z_tilde
-            self.innovation[row, i] = structure.innovation[i]
+            z_hat[i], z_tilde[i] = structure.level[i].z_hat, structure.level[i].z_tilde
+            innovation[i] = structure.innovation[i]
         for i in range(structure.order):
-            self.z[row, i] = structure.estimate(i)
+            z[i] = structure.estimate(i)
         for i in range(<int>self.standard_deviation.shape[1]):
             self.standard_deviation[row, i] = sqrt(structure.variance(i))
         if self.model.shape[1] > 0:

@@ -63,9 +63,6 @@ cdef struct Sample:
 
 cdef struct Work:
     # What a step needs for itself.
-    Sample sample
-    double now[COLOURS]  # variance of the noise of each colour at this sample
-    int first, last  # members whose covariances move, and the one behind them
     Line b  # innovations
     Line s  # their variances over that of the noise
     Line believed  # the same, as far as it is believed
@@ -80,11 +77,14 @@ cdef struct Work:
     Estimates x  # predictions
     Estimates pc  # P C'
     Covariances p, q  # predictions, and what the intensities add to them
-    double q_interval, q_white, q_jerk  # what `q` holds for: h and two intensities,
-    int q_first, q_last  # and members
     Line product_z[MOST_ORDER][MOST_ORDER]  # A P, of z
     Line product_d[MOST_ORDER][ORDERS]
     Line chain[MOST_ORDER][ORDERS]  # what (D + kappa)^j d does to each z
+    Sample sample
+    double now[COLOURS]  # variance of the noise of each colour at this sample
+    int first, last  # members whose covariances move, and the one behind them
+    double q_interval, q_white, q_jerk  # what `q` holds for: h and two intensities,
+    int q_first, q_last  # and members
 
 
 cdef struct Shared:
@@ -119,10 +119,7 @@ cdef struct Shared:
 
 
 cdef struct Members:
-    int n  # states of the model
-    Shared shared
-    double first_y[FIRST_SAMPLES]  # the first samples
-    double first_h[FIRST_SAMPLES]  # and the intervals before them (s)
+    # Lines come first, so that they begin where vectors of the processor do.
     Line kappa  # rate at which d decays (1/s)
     Line tau  # correlation time of the noise (s); 0: white
     Line correlation  # a, of samples a period apart
@@ -140,6 +137,11 @@ cdef struct Members:
     Estimates x
     Estimates gain  # by what an innovation corrects them
     Covariances p
+    Work work
+    int n  # states of the model
+    Shared shared
+    double first_y[FIRST_SAMPLES]  # the first samples
+    double first_h[FIRST_SAMPLES]  # and the intervals before them (s)
     double sizes[MOST_ORDER]  # mean squares of z; at first larger by the factor DOUBT^2
     double noise[COLOURS]  # variance of the noise of each colour, but for that of stamps
     double late[COLOURS]  # share of `jitter` that is error of the stamps (D 29)
@@ -148,7 +150,6 @@ cdef struct Members:
     double rough[COLOURS][DIFFERENCES]  # what those of order 1 to n + 1 say noise is at most
     double flow[MOST_STATES][MOST_STATES]  # derivative of the prediction to the next sample
     double window[WINDOW]  # innovations over their standard deviations, of one member (D 35)
-    Work work
 
 
 cdef Grid GRID

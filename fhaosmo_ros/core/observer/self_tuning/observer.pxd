@@ -13,6 +13,7 @@ cdef class SelfTuning(Structure):
     cdef double forgetting  # time constant of the log-likelihoods (s); 0: `MEMORY` samples
     cdef double slider  # estimates are those of members so much quicker
     # What it remembers.
+    cdef void* block  # of memory, which holds the members
     cdef Members* members
     cdef Model model  # the likeliest model of d, which a smoother goes by (D 34)
     cdef double variances[MOST_LEVELS]  # of the errors of z, d, ..; infinite before it begins

@@ -33,6 +33,8 @@ from fhaosmo_ros.core.observer.numbers import array_of
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 import numpy as np
 
+cdef enum:
+    CACHE_LINE = 64  # bytes; a vector of the processor that crosses two takes twice as long
 # A log-likelihood is remembered for so many samples, unless `tuning_memory` says otherwise.
 cdef double MEMORY = 8000.0
 cdef double NOISE_SAMPLES = 1000.0  # the noise is averaged over so many
@@ -76,13 +78,14 @@ cdef class SelfTuning(Structure):
         p = configuration.parameters
         self.is_linear = configuration.model.is_linear
         self.forgetting, self.slider = p['tuning_memory'], p['bandwidth']
-        self.members = <Members*>calloc(1, sizeof(Members))
-        if self.members == NULL:
+        self.block = calloc(1, sizeof(Members) + CACHE_LINE)
+        if self.block == NULL:
             raise MemoryError
+        self.members = <Members*>((<size_t>self.block // CACHE_LINE + 1) * CACHE_LINE)
         self.members.n = self.order
 
     def __dealloc__(self):
-        free(self.members)
+        free(self.block)
 
     cdef void reset(self) noexcept nogil:
         """Go back to the state before any sample."""
