@@ -87,7 +87,7 @@ def in_c(folder: Path, y: np.ndarray) -> Callable[[], np.ndarray]:
     period, count = ctypes.c_double(PERIOD), ctypes.c_long(BLOCK)
 
     def run() -> np.ndarray:
-        state, record = start.copy(), np.empty((BLOCK, 19))
+        state, record = start.copy(), np.empty((BLOCK, 21))
         for y in rest.reshape(-1, BLOCK):
             at = [x.ctypes.data_as(ctypes.c_void_p) for x in (law, state, y, record)]
             function(*at[:3], period, count, at[3])

@@ -103,17 +103,13 @@ static int step(const struct law *law, double *state, double y, double h, double
 }
 
 /* Step through `count` samples of period `h`; `eps` and the last status word are the result. */
-/* `record` has a row of 19 numbers a sample, as many as the core records. */
+/* `record` has a row of 21 numbers a sample; the core records 19. */
 int run(const struct law *law, double *state, const double *y, double h, long count, double *record)
 {
     int word = 0;
-    for (long k = 0; k < count; k++, record += 19) {
-        word = step(law, state, y[k], h, record + 8);
-        memcpy(record, state, 8 * sizeof(double));
-        memcpy(record + 12, state, 4 * sizeof(double));
-        record[16] = state[16];
-        record[17] = word & ((1 << LEVEL_SHIFT) - 1);
-        record[18] = word >> LEVEL_SHIFT;
+    for (long k = 0; k < count; k++, record += 21) {
+        word = step(law, state, y[k], h, record + 17);
+        memcpy(record, state, 17 * sizeof(double));
     }
     return word;
 }
