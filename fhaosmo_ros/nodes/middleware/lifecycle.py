@@ -109,9 +109,8 @@ class ManagedNode(LifecycleNode, TimedNode):
         before, wanted = self.state, request.transition.label or request.transition.id
         try:
             response = self._rclpy_change_state(request, response)
-        except (
-            RuntimeError
-        ):  # in rclpy 7.1 for what the state does not allow; it ends the spinning
+        except RuntimeError:
+            # Of rclpy 7.1, for what the state does not allow; it would end the spinning.
             response.success = False
         if response.success:
             log.info(f'{before} -> {self.state}')

@@ -95,7 +95,8 @@ def save_curves(
         axes[name].set_ylabel(those[0].title(name))
         # What comes after the first tenth fills the picture.
         late = [c.estimate[len(c.stamps) // 10 :, c.names.index(name)] for c in those]
-        known = np.concatenate(late)[np.isfinite(np.concatenate(late))]
+        known = np.concatenate(late)
+        known = known[np.isfinite(known)]
         if len(known):
             margin = 0.1 * float(np.ptp(known)) or 0.1 * abs(float(known[0])) or 1.0
             axes[name].set_ylim(known.min() - margin, known.max() + margin)

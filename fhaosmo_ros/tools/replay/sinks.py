@@ -15,7 +15,16 @@ from fhaosmo_ros.core.parameters.units import derivative_unit
 from fhaosmo_ros.tools.bags import types
 from fhaosmo_ros.tools.bags.reader import BagReader
 from fhaosmo_ros.tools.bags.writer import BagWriter
-from fhaosmo_ros.topics import ARRAY, DIAGNOSTICS, estimates_of, EVENT, PARAMETERS, TEXT, TIME
+from fhaosmo_ros.topics import (
+    ARRAY,
+    DIAGNOSTICS,
+    estimates_of,
+    EVENT,
+    PARAMETERS,
+    STANDARD_DEVIATION,
+    TEXT,
+    TIME,
+)
 import numpy as np
 from numpy.typing import NDArray
 
@@ -110,7 +119,7 @@ def bag_sink(
     state = [f'z{i + 1}' for i in range(observer.order)]
     labels = {
         'state': state, 'innovation': [f'eps{i + 1}' for i in range(observer.levels)],
-        'standard_deviation': [*state, 'd'], 'tuning': TUNING,
+        STANDARD_DEVIATION: [*state, 'd'], 'tuning': TUNING,
     }  # fmt: skip
     empty = {}
     with BagWriter(path) as bag:
@@ -131,7 +140,7 @@ def bag_sink(
                 text = None
             e = rows.estimates
             found = {
-                'gamma': e.gamma, 'standard_deviation': e.standard_deviation, 'tuning': e.tuning,
+                'gamma': e.gamma, STANDARD_DEVIATION: e.standard_deviation, 'tuning': e.tuning,
                 'state': e.z, 'unknown_input': e.unknown_input, 'innovation': e.innovation,
                 'stamp': np.column_stack(np.divmod(e.t, 1_000_000_000)).astype('<i4'),
             }  # fmt: skip
