@@ -83,11 +83,11 @@ cdef class Joint(Dynamics):
         memset(rate, 0, self.size * sizeof(double))
         self.plant.rates(stage, t, now.z, rate.z)
         # A forward Euler step of length 1 moves the levels by their rates.
-        memcpy(self.observer.trial, now.level, self.observer.levels * sizeof(Level))
+        memcpy(self.observer.level, now.level, self.observer.levels * sizeof(Level))
         self.observer.memory.gamma, self.observer.memory.y = now.gamma, now.z[0]
         self.observer.follow(now.z[0], 1.0, self.u)
         for i in range(self.observer.levels):
-            after = &self.observer.trial[i]
+            after = &self.observer.level[i]
             rate.level[i].z_hat = after.z_hat - now.level[i].z_hat
             rate.level[i].z_tilde = after.z_tilde - now.level[i].z_tilde
             rate.level[i].p = after.p - now.level[i].p

@@ -8,6 +8,7 @@ The super-twisting algorithm: Levant 1998 (doi:10.1016/S0005-1098(97)00209-4), M
 (doi:10.1016/j.sysconle.2010.03.002).
 """
 
+from cython cimport final
 from libc.math cimport copysign, exp, fabs, log, log1p, pow, sqrt
 
 from fhaosmo_ros.core.model.phi cimport Dual, evaluate
@@ -33,7 +34,7 @@ cdef class Cascade(SlidingMode):
     """The paper's observer: level i follows z_i by the super-twisting algorithm."""
 
     cdef void follow(self, double y, double h, const double* u) noexcept nogil:
-        """Advance `trial` by the scheme, or start as a Kalman filter."""
+        """Advance the levels by the scheme, or start as a Kalman filter."""
         if self.scheduled and self.memory.settled <= 0.0:
             self.start_as_kalman(y, h, u)
         elif self.implicit:
@@ -49,16 +50,16 @@ cdef class Cascade(SlidingMode):
         cdef double s, b
         self.linear.predict(self.trial_covariance, h)
         s = self.trial_covariance[0][0] + doubt * doubt * self.noise_variance
-        self.predict_trial(h, u)
+        self.predict_levels(h, u)
         b = y - self.prediction.z[0]
         b = min(max(b, -MOST_SIGMAS * sqrt(s)), MOST_SIGMAS * sqrt(s))
         for i in range(n):
             # K = P C' / S
-            self.trial[i].z_hat = self.prediction.z[i] + self.trial_covariance[0][i] / s * b
-            self.trial[i].p = self.trial[i].q = 0.0
+            self.level[i].z_hat = self.prediction.z[i] + self.trial_covariance[0][i] / s * b
+            self.level[i].p = self.level[i].q = 0.0
         for i in range(n):
-            self.trial[i].z_tilde = self.trial[i + 1].z_hat if i + 1 < n else 0.0
-        self.correct_trial(doubt)
+            self.level[i].z_tilde = self.level[i + 1].z_hat if i + 1 < n else 0.0
+        self.correct_covariance(doubt)
         memory.settled -= h
         if -memory.settled * speed > LONG:
             self.hand_over(u)
@@ -66,17 +67,17 @@ cdef class Cascade(SlidingMode):
 
     cdef void hand_over(self, const double* u) noexcept nogil:
         """
-        Put the levels where they would be if they had followed the estimates of `trial`.
+        Put the levels where they would be if they had followed the estimates of the filter.
 
         Level i then has alpha_i psi_i(eps_i) = z_{i+1}', and its internal state lags by its
         injection.
         """
         cdef double z[MOST_LEVELS + 2]
         cdef double still[MOST_LEVELS]
-        cdef double m = self.trial[0].z_hat, rate, wanted, low, high, middle, injection
+        cdef double m = self.level[0].z_hat, rate, wanted, low, high, middle, injection
         cdef int i, _, n = self.levels
         for i in range(n):
-            z[i], still[i] = self.trial[i].z_hat, 0.0
+            z[i], still[i] = self.level[i].z_hat, 0.0
         z[n] = z[n + 1] = 0.0
         for i in range(n):
             rate = z[i + 2]
@@ -92,9 +93,10 @@ cdef class Cascade(SlidingMode):
                     high = middle
             injection = self.gains[i].lambda_ * pow(high, self.memory.gamma) * wanted
             injection = injection if high > 0.0 else 0.0
-            self.trial[i].z_hat = m - copysign(high, rate)
-            m = self.trial[i].z_tilde = z[i + 1] - copysign(injection, rate)
+            self.level[i].z_hat = m - copysign(high, rate)
+            m = self.level[i].z_tilde = z[i + 1] - copysign(injection, rate)
 
+    @final
     cdef void explicit(self, double gamma, double y, double h, const double* u) noexcept nogil:
         """
         Forward Euler of P adaptivesupertwistingobserverfuzzymodified.
@@ -112,9 +114,9 @@ cdef class Cascade(SlidingMode):
         cdef int i
         m[0], dm[0] = y, 0.0
         for i in range(1, self.levels):
-            m[i], dm[i] = self.trial[i - 1].z_tilde, self.trial[i - 1].q  # m_i = z_tilde_i
+            m[i], dm[i] = self.level[i - 1].z_tilde, self.level[i - 1].q  # m_i = z_tilde_i
         for i in range(self.levels):
-            level = &self.trial[i]
+            level = &self.level[i]
             eps = m[i] - level.z_hat
             s = dm[i] - level.p  # s_i = d eps_i / d gamma
             loss += eps * eps  # P lossfunction
@@ -166,9 +168,9 @@ cdef class Cascade(SlidingMode):
         cdef int i
         m[0], dm[0] = y, 0.0
         for i in range(self.levels):
-            level = &self.trial[i]
+            level = &self.level[i]
             if i > 0:  # already at the new time
-                m[i], dm[i] = self.trial[i - 1].z_tilde, self.trial[i - 1].q
+                m[i], dm[i] = self.level[i - 1].z_tilde, self.level[i - 1].q
             if not running:
                 held = m[i] - level.z_hat
                 loss += held * held

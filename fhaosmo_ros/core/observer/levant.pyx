@@ -98,7 +98,7 @@ cdef class Levant(SlidingMode):
         memory.scale = 1.0
 
     cdef void follow(self, double y, double h, const double* u) noexcept nogil:
-        """Follow the model to the sample `y`, then correct `trial` (D 18)."""
+        """Follow the model to the sample `y`, then correct the levels (D 18)."""
         cdef Memory* memory = &self.memory
         cdef Row* p = self.trial_covariance
         cdef int i, n = self.levels
@@ -109,23 +109,23 @@ cdef class Levant(SlidingMode):
         if scheduling:
             if memory.settled > 0.0:
                 memcpy(p, self.steady, n * sizeof(Row))
-                self.correct_trial(1.0)
+                self.correct_covariance(1.0)
                 memory.settled = -LONG_AGO
             doubt = doubt_of_noise(-memory.settled, self.bandwidth(period))
             self.linear.predict(p, h)
             variance = p[0][0] + doubt * doubt * self.noise_variance
-        self.predict_trial(h, u)
+        self.predict_levels(h, u)
         for i in range(n):
-            self.trial[i].z_hat, self.ratio[i] = self.prediction.z[i], 1.0
+            self.level[i].z_hat, self.ratio[i] = self.prediction.z[i], 1.0
         if not self.scheduled:
             if period > 0.0:  # not below the mean interval: another rate is no gap
                 h = min(h, max(period, memory.period))
             self.correct_levels(y, h)
             return
-        b = y - self.trial[0].z_hat
+        b = y - self.level[0].z_hat
         usual = follow_spread(memory, b, sqrt(variance))
         if variance < NEARLY_STEADY * self.steady_variance:  # a large P counts on all of b
-            y = self.trial[0].z_hat + self.influence(b, usual)
+            y = self.level[0].z_hat + self.influence(b, usual)
         if memory.beyond > 0.0:
             return
         if scheduling:
@@ -139,7 +139,7 @@ cdef class Levant(SlidingMode):
                 far = far or fabs(self.ratio[i] - 1.0) > CLOSE
             for i in range(n):  # from the Kalman filter's gains to the tuned ones
                 self.ratio[i] *= pow(self.tuned_over_kalman[i], 1.0 / largest - 1.0)
-            self.correct_trial(doubt)
+            self.correct_covariance(doubt)
             memory.settled = memory.settled - h if far else 1.0
         self.correct_levels(y, period)
 
@@ -148,7 +148,7 @@ cdef class Levant(SlidingMode):
         cdef double weight[MOST_LEVELS]  # h^i lambda_i
         cdef double power_of_h[MOST_LEVELS]  # h^i
         cdef double scale = self.memory.scale, power = 1.0, v, share
-        cdef double b = (y - self.trial[0].z_hat) / scale  # D 22
+        cdef double b = (y - self.level[0].z_hat) / scale  # D 22
         cdef int i, j, n = self.levels
         cdef Root root
         power_of_h[0], weight[0] = h, self.ratio[0] * h * self.gains[0].lambda_
@@ -160,17 +160,17 @@ cdef class Levant(SlidingMode):
             v = power * psi(self, i, root.eps).value if root.eps > 0.0 else 0.0
             if i == n - 1:
                 v = root.s
-            self.trial[i].z_tilde = self.gains[i].lambda_ * copysign(v, b)
+            self.level[i].z_tilde = self.gains[i].lambda_ * copysign(v, b)
             power *= root.w
         for i in range(n):
             for j in range(i, n):
                 share = scale * self.ratio[i] * power_of_h[j - i] * self.share[j, i]
-                self.trial[i].z_hat += share * self.trial[j].z_tilde
+                self.level[i].z_hat += share * self.level[j].z_tilde
         self.grow(root.eps, h)
         # What the sum above is but for rounding.
-        self.trial[0].z_hat = y - copysign(scale * root.eps, b)
+        self.level[0].z_hat = y - copysign(scale * root.eps, b)
         for i in range(n):
-            self.trial[i].z_tilde = self.trial[i + 1].z_hat if i + 1 < n else 0.0
+            self.level[i].z_tilde = self.level[i + 1].z_hat if i + 1 < n else 0.0
 
     cdef Root root(self, const double* weight, double b, double gamma) noexcept nogil:
         """
@@ -268,7 +268,7 @@ cdef class Levant(SlidingMode):
         cdef int i, n = self.levels
         if memory.settled > 0.0:
             memcpy(p, self.steady, n * sizeof(Row))
-            self.correct_trial(1.0)
+            self.correct_covariance(1.0)
             memory.settled = -LONG_AGO
         else:
             memcpy(p, self.covariance, n * sizeof(Row))

@@ -45,9 +45,9 @@ cdef class SlidingMode(Structure):
     cdef Row fresh[MOST_LEVELS]  # P of a fresh observer
     cdef void follow(self, double y, double h, const double* u) noexcept nogil
     cdef int adapt(self, double h) noexcept nogil
-    cdef void predict_trial(self, double h, const double* u) noexcept nogil
+    cdef void predict_levels(self, double h, const double* u) noexcept nogil
     cdef double bandwidth(self, double h) noexcept nogil
-    cdef void correct_trial(self, double doubt) noexcept nogil
+    cdef void correct_covariance(self, double doubt) noexcept nogil
 
 
 cdef double doubt_of_noise(double age, double speed) noexcept nogil

@@ -7,6 +7,7 @@ linearised at rest, with a Matern model of d (D 17, D 20). It begins with the si
 of d and of the noise that parameters tell.
 """
 
+from cython cimport final
 from libc.math cimport INFINITY, NAN, exp, fabs, isfinite, pow
 from libc.string cimport memcpy
 
@@ -120,16 +121,14 @@ cdef class SlidingMode(Structure):
         self.follow(y, h, u)
 
     cdef void follow(self, double y, double h, const double* u) noexcept nogil:
-        """Advance `trial` by the equations of the structure and its scheme."""
+        """Advance the levels by the equations of the structure and its scheme."""
 
     cdef int accept(self, double y, double h) noexcept nogil:
-        """Adapt gamma, then accept."""
-        cdef int word = self.adapt(h) if self.adaptive else 0
-        Structure.accept(self, y, h)
         if self.scheduled:
             memcpy(self.covariance, self.trial_covariance, self.levels * sizeof(Row))
-        return word
+        return self.adapt(h) if self.adaptive else 0
 
+    @final
     cdef int adapt(self, double h) noexcept nogil:
         """
         Change gamma (P adaptationlawgamma); return status flags.
@@ -140,13 +139,13 @@ cdef class SlidingMode(Structure):
         cdef double gamma = self.memory.gamma
         cdef bint rests = self.loss <= self.dead_zone * self.dead_zone
         for i in range(self.levels):
-            if not (fabs(self.trial[i].p) < SENSITIVITY_LIMIT
-                    and fabs(self.trial[i].q) < SENSITIVITY_LIMIT):
+            if not (fabs(self.level[i].p) < SENSITIVITY_LIMIT
+                    and fabs(self.level[i].q) < SENSITIVITY_LIMIT):
                 word = SENSITIVITY_RESET
         if word or not isfinite(self.gradient):
             word = SENSITIVITY_RESET
             for i in range(self.levels):
-                self.trial[i].p = self.trial[i].q = 0.0
+                self.level[i].p = self.level[i].q = 0.0
         if self.dead_zone == 0.0 or rests:
             gamma -= min(h * self.leakage, 1.0) * (gamma - self.gamma_initial)
         if not (word or rests):
@@ -160,17 +159,17 @@ cdef class SlidingMode(Structure):
         self.memory.gamma = gamma
         return word
 
-    cdef void predict_trial(self, double h, const double* u) noexcept nogil:
-        """Let the prediction go on from the estimates of `trial` by `h`."""
+    cdef void predict_levels(self, double h, const double* u) noexcept nogil:
+        """Let the prediction go on from the estimates by `h`."""
         cdef int i
         for i in range(self.levels):
-            self.prediction.z[i], self.prediction.dz[i] = self.trial[i].z_hat, 0.0
+            self.prediction.z[i], self.prediction.dz[i] = self.level[i].z_hat, 0.0
         self.prediction.over(h, u)
 
     cdef double bandwidth(self, double h) noexcept nogil:
         """Return the rate (1/s) at which the Kalman filter for samples every `h` forgets."""
         return pow(self.linear.intensity / (self.noise_variance * h), 0.5 / self.levels)
 
-    cdef void correct_trial(self, double doubt) noexcept nogil:
+    cdef void correct_covariance(self, double doubt) noexcept nogil:
         """Take a sample into P; its noise counts as `doubt` times as large."""
         correct(self.levels, self.trial_covariance, doubt * doubt * self.noise_variance)

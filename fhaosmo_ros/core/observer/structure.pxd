@@ -65,8 +65,9 @@ cdef class Structure:
     cdef readonly Memory memory
     cdef Level level[MOST_LEVELS]
     cdef Row covariance[MOST_LEVELS]  # P of the errors (D 20); not used without noise_size
-    # A step's own: the levels and P while they are changed, and what it finds.
-    cdef Level trial[MOST_LEVELS]
+    # A step's own: the levels that a rejected sample goes back to, P while it is changed, and what
+    # is found.
+    cdef Level before[MOST_LEVELS]
     cdef Row trial_covariance[MOST_LEVELS]
     cdef double innovation[MOST_LEVELS]  # eps_i = m_i - z_hat_i after the latest sample
     cdef double loss, gradient  # L and dL/dgamma
@@ -98,11 +99,11 @@ cdef bint has_drifted(Memory* memory, double off) noexcept nogil
 
 
 cdef class Record:
-    # What a run records, a row for each recorded sample, as `Trajectory` says.
-    cdef readonly dict columns  # the same by name
-    cdef double[:, ::1] z, innovation, z_hat, z_tilde, standard_deviation, model, tuning
-    cdef double[::1] unknown_input, gamma
-    cdef long long[::1] status, open_levels
+    cdef Structure structure  # whose run it is
+    # A row for each sample, as `Trajectory` says.
+    cdef double[:, ::1] z_hat, z_tilde, innovation, standard_deviation, model, tuning
+    cdef double[::1] gamma
+    cdef int[::1] word
     cdef void write(self, Structure structure, Py_ssize_t row, int word) noexcept nogil
 
 

@@ -25,8 +25,8 @@ import numpy as np
 
 LOST_SAMPLES = 20
 GATE = 6.0
-# Intervals that the running mean remembers.
-cdef double MEAN_OF = 32.0
+# By this part the running mean of the intervals follows the latest one.
+cdef double FOLLOWING = 1.0 / 32.0
 # Values above the largest double over this are rejected, so that differences cannot overflow.
 cdef double HEADROOM = 1e8
 # Samples after a jump of y in which prediction errors may not sum up (D 23).
@@ -38,10 +38,6 @@ cdef double MOST_DRIFT = 35.0
 # If a jump of y would make |z_{i+1}| or |d| so much smaller, y was wrong before it (D 23).
 cdef double MUCH_SMALLER = 0.5
 OF_LEVELS = 'z_hat', 'z_tilde', 'p', 'q'
-COLUMNS = (
-    'z', 'innovation', 'z_hat', 'z_tilde', 'standard_deviation', 'model', 'tuning',
-    'unknown_input', 'gamma', 'status', 'open_levels',
-)
 
 
 cdef bint has_drifted(Memory* memory, double off) noexcept nogil:
@@ -134,13 +130,14 @@ cdef class Structure:
             word |= REJECTED_PERIOD
         if not word:
             whole = h + memory.pending
-            copy_levels(self.levels, self.level, self.trial)
+            copy_levels(self.levels, self.level, self.before)
             self.advance(y, whole, u)
             for i in range(self.levels):  # a difference of equals is 0, or NaN if not finite
-                zero += HEADROOM * self.trial[i].z_hat - HEADROOM * self.trial[i].z_hat
-                zero += HEADROOM * self.trial[i].z_tilde - HEADROOM * self.trial[i].z_tilde
+                zero += HEADROOM * self.level[i].z_hat - HEADROOM * self.level[i].z_hat
+                zero += HEADROOM * self.level[i].z_tilde - HEADROOM * self.level[i].z_tilde
             if zero != 0.0:
                 word = REJECTED_STEP
+                copy_levels(self.levels, self.before, self.level)
                 # Nothing of the sample may make the next step fail as well: not its time, and not
                 # the y at the interval's beginning, which is what fails explicitly.
                 memory.pending = 0.0
@@ -154,17 +151,19 @@ cdef class Structure:
                 self.restart(measured)
                 word = DIVERGED
             elif memory.beyond > 0.0:
+                copy_levels(self.levels, self.before, self.level)
                 memory.pending = whole
                 word = REJECTED_SPIKE
             else:
                 word = self.accept(y, whole)
                 memory.y, memory.pending = y, 0.0
                 mean = memory.period if memory.period > 0.0 else whole
-                memory.period = mean + (min(whole, 2.0 * mean) - mean) / MEAN_OF
+                memory.period = mean + FOLLOWING * (min(whole, 2.0 * mean) - mean)
         if word & (REJECTED_MEASUREMENT | REJECTED_INPUT) and not word & REJECTED_PERIOD:
             memory.pending += h
         return word | self.measure(memory.y)
 
+    @final
     cdef int measure(self, double y) noexcept nogil:
         """Write eps_i = m_i - z_hat_i; return the number of open levels, shifted for a word."""
         cdef int i, count = 0
@@ -209,14 +208,13 @@ cdef class Structure:
 
     cdef void advance(self, double y, double h, const double* u) noexcept nogil:
         """
-        Change `trial`, and write L and its gradient, by a sample `h` seconds after the last one.
+        Bring the levels, and write L and its gradient, to a sample `h` seconds after the last one.
 
         `Memory.beyond` counts samples that are too unlikely to be used.
         """
 
     cdef int accept(self, double y, double h) noexcept nogil:
-        """Make `trial` the state; return status flags."""
-        copy_levels(self.levels, self.trial, self.level)
+        """Keep what a step has made; return status flags."""
         return 0
 
     cdef void fail(self, double y) noexcept nogil:
@@ -259,22 +257,23 @@ cdef class Structure:
         cdef double small = GATE * memory.spread * sqrt(2.0 * self.innovation_variance())
         cdef double z[MOST_LEVELS]
         cdef double still[MOST_LEVELS]
-        cdef double change, behind
+        cdef double predicted = self.level[0].z_hat, change, behind
         cdef bint is_back = fabs(total) <= small, contradicted = False, larger = True
         cdef int i
+        for i in range(self.levels):
+            z[i], still[i] = self.level[i].z_hat, 0.0
+        copy_levels(self.levels, self.before, self.level)
         if not (memory.beyond < INFINITY and fabs(b - memory.first_miss) <= small):
             memory.jumps = 0.0
             return False
         for i in range(self.levels):
-            z[i], still[i] = self.trial[i].z_hat, 0.0
-        for i in range(self.levels):
-            z[0] = self.trial[0].z_hat
+            z[0] = predicted
             change = evaluate(self.prediction.phi, i, z, still, u).value
-            z[0] = self.trial[0].z_hat + offset
+            z[0] = predicted + offset
             change -= evaluate(self.prediction.phi, i, z, still, u).value
             if not fabs(change) <= self.most_change(i):
                 contradicted = True
-                behind = self.trial[i + 1].z_hat if i + 1 < self.levels else 0.0
+                behind = z[i + 1] if i + 1 < self.levels else 0.0
                 larger = larger and not fabs(behind + change) <= MUCH_SMALLER * fabs(behind)
         memory.jumps = 0.0 if is_back else total
         if contradicted and not is_back:
@@ -287,7 +286,7 @@ cdef class Structure:
             memory.offset = 0.0
             self.level[0].z_hat += offset
             memory.y += offset
-        self.go_on_after_jump(self.level[0].z_hat - self.trial[0].z_hat)
+        self.go_on_after_jump(self.level[0].z_hat - predicted)
         memory.beyond = memory.drift = memory.one_sided = 0.0
         memory.watched = WATCH
         return True
@@ -399,37 +398,48 @@ cdef class Structure:
 
 
 cdef class Record:
-    """What a run of a structure records: arrays of so many rows by the names of `Trajectory`."""
+    """What a run of a structure records: a row for each sample."""
 
     def __cinit__(self, Structure structure not None, Py_ssize_t rows):
-        cdef int n = structure.order, levels = structure.levels
-        own = (n + 1, 4, 7) if structure.configuration.self_tuning else (0, 0, 0)
-        found = [np.empty((rows, width)) for width in (n, levels, levels, levels, *own)]
-        found += [np.empty(rows, dtype=kind) for kind in (float, float, np.int64, np.int64)]
-        self.columns = dict(zip(COLUMNS, found, strict=True))
-        self.z, self.innovation, self.z_hat, self.z_tilde = found[:4]
-        self.standard_deviation, self.model, self.tuning = found[4:7]
-        self.unknown_input, self.gamma, self.status, self.open_levels = found[7:]
+        cdef int levels = structure.levels
+        own = (structure.order + 1, 4, 7) if structure.configuration.self_tuning else (0, 0, 0)
+        self.structure = structure
+        self.z_hat, self.z_tilde, self.innovation = (np.empty((rows, levels)) for _ in range(3))
+        self.standard_deviation, self.model, self.tuning = (np.empty((rows, k)) for k in own)
+        self.gamma, self.word = np.empty(rows), np.empty(rows, dtype=np.intc)
 
     cdef void write(self, Structure structure, Py_ssize_t row, int word) noexcept nogil:
-        """Record what an observer knows."""
-        cdef int i
-        cdef double* z = &self.z[row, 0]
+        """Record what the observer knows."""
         cdef double* z_hat = &self.z_hat[row, 0]
         cdef double* z_tilde = &self.z_tilde[row, 0]
         cdef double* innovation = &self.innovation[row, 0]
+        cdef int i
         for i in range(structure.levels):
             z_hat[i], z_tilde[i] = structure.level[i].z_hat, structure.level[i].z_tilde
             innovation[i] = structure.innovation[i]
-        for i in range(structure.order):
-            z[i] = structure.estimate(i)
         for i in range(<int>self.standard_deviation.shape[1]):
             self.standard_deviation[row, i] = sqrt(structure.variance(i))
         if self.model.shape[1] > 0:
             structure.tell(&self.model[row, 0], &self.tuning[row, 0])
-        self.unknown_input[row] = structure.estimate(structure.order)
-        self.gamma[row] = structure.memory.gamma
-        self.status[row], self.open_levels[row] = word & FLAGS_MASK, word >> LEVEL_SHIFT
+        self.gamma[row], self.word[row] = structure.memory.gamma, word
+
+    @property
+    def columns(self):
+        """The same by the names of `Trajectory`, with the estimates that `estimate` returns."""
+        cdef int n = self.structure.order
+        cdef int filtered = 1 if self.structure.internal else min(self.structure.levels, n + 1)
+        z_hat, z_tilde = np.asarray(self.z_hat), np.asarray(self.z_tilde)
+        word = np.asarray(self.word)
+        estimates = np.hstack([z_hat[:, :filtered], z_tilde[:, filtered - 1:n]])
+        return {
+            'z': estimates[:, :n], 'unknown_input': estimates[:, n],
+            'gamma': np.asarray(self.gamma), 'innovation': np.asarray(self.innovation),
+            'status': (word & FLAGS_MASK).astype(np.int64),
+            'open_levels': (word >> LEVEL_SHIFT).astype(np.int64),
+            'z_hat': z_hat, 'z_tilde': z_tilde,
+            'standard_deviation': np.asarray(self.standard_deviation),
+            'model': np.asarray(self.model), 'tuning': np.asarray(self.tuning),
+        }
 
 
 def run(

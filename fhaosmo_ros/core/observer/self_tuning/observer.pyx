@@ -133,17 +133,15 @@ cdef class SelfTuning(Structure):
             self.step_members(y, h, u)
         else:
             for i in range(n):
-                self.trial[i].z_hat, self.trial_variances[i] = 0.0, INFINITY
-            self.trial[0].z_hat = y
+                self.level[i].z_hat, self.trial_variances[i] = 0.0, INFINITY
+            self.level[0].z_hat = y
             gather(self.members)
         for i in range(n):  # the internal states stand for the estimates
-            self.trial[i].z_tilde = self.trial[i + 1].z_hat if i + 1 < n else 0.0
+            self.level[i].z_tilde = self.level[i + 1].z_hat if i + 1 < n else 0.0
 
     cdef int accept(self, double y, double h) noexcept nogil:
-        """Make `trial` the state; return status flags."""
         cdef int word = JUMPED if self.y_jumped else 0, i
         cdef double square, size, count = fmin(self.members.shared.samples, NOISE_SAMPLES)
-        Structure.accept(self, y, h)
         for i in range(self.order if self.has_begun() else 0):
             square, size = self.level[i].z_hat * self.level[i].z_hat, self.members.sizes[i]
             self.members.sizes[i] = size + (square - size) / count
@@ -212,7 +210,7 @@ cdef class SelfTuning(Structure):
 
     cdef void step_members(self, double y, double h, const double* u) noexcept nogil:
         """
-        Advance the members, and the estimates of `trial`, to the sample `y`.
+        Advance the members, and the estimates, to the sample `y`.
 
         A sample that is too far off is counted in `Memory.beyond`, and changes no member.
         """
@@ -232,7 +230,7 @@ cdef class SelfTuning(Structure):
         follow_stamps(m, h, memory.beyond > 0.0)
         same = fabs(h - shared.flow_period) <= EXACT * shared.flow_period
         self.carry_flow(h, u, same)
-        speed = (self.prediction.z[0] - self.trial[0].z_hat) / h
+        speed = (self.prediction.z[0] - self.level[0].z_hat) / h
         shared.of_stamps = shared.jitter * speed * speed
         sample.uneven += fmax(shared.jitter, sample.irregular) * speed * speed
         fill_noise(m)
@@ -246,7 +244,7 @@ cdef class SelfTuning(Structure):
         sample.off = y - self.prediction.z[0]
         # A sample that is not likely changes no member: what it makes of them stands apart.
         for i in range(self.levels):
-            mean[i] = self.trial[i].z_hat
+            mean[i] = self.level[i].z_hat
         predict_states(m, h, mean, self.prediction.z)
         expect(m, h, y)
         find_knowing(m, memory.beyond > 0.0)
@@ -291,7 +289,7 @@ cdef class SelfTuning(Structure):
             weigh(m)
         mix(m, self.slider, mean, self.trial_variances)
         for i in range(self.levels):
-            self.trial[i].z_hat = mean[i]
+            self.level[i].z_hat = mean[i]
         tell_model(m, self.slider, jumped, &self.trial_model)
         for i in range(shared.active):
             if m.far[i] > LOST_SAMPLES:  # far off for long
@@ -342,7 +340,7 @@ cdef class SelfTuning(Structure):
         cdef int i, j
         for j in range(self.levels - 1 if self.is_linear and same else 0, self.levels):
             for i in range(self.levels):
-                self.prediction.z[i], self.prediction.dz[i] = self.trial[i].z_hat, 0.0
+                self.prediction.z[i], self.prediction.dz[i] = self.level[i].z_hat, 0.0
             self.prediction.dz[j] = 1.0
             self.prediction.over(h, u)
             for i in range(self.levels):
