@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 MS = 1_000_000
-START = 1_700_000_000 * 10**9
+START = 100 * 10**9
 
 
 def sample(k: float) -> float:
@@ -21,7 +21,7 @@ def times_by(readings):
     found = []
     for k, reading in enumerate(readings.tolist()):
         estimator.update(reading, sample(k))
-        found.append(estimator.stamp)
+        found.append(estimator.stamp or 0)
     assert estimator.counters.restarts == estimator.counters.backward_stamps == 0
     return np.array(found), estimator
 
@@ -58,11 +58,11 @@ def test_late_ticks_and_samples_hardly_move_the_times(late):
 
 
 def test_clock_that_ticks_slower_than_samples_come_spreads_them():
-    """1 kHz on a clock of 40 Hz: from the third tick on as if it had true stamps."""
-    times, ticked = times_by(SLOW)
+    """1 kHz on a clock of 40 Hz, heard late: from the third tick on as if it had true stamps."""
+    times, ticked = times_by(np.where(np.arange(10_000) < 50, 0, SLOW))
     true = OnlineEstimator()
-    true.run(TRUE, [sample(k) for k in range(len(TRUE))])
-    assert np.abs(times - TRUE)[100:].max() <= 13 * MS
+    true.run(TRUE[50:], [sample(k) for k in range(50, len(TRUE))])
+    assert np.abs(times - TRUE)[150:].max() <= 13 * MS
     assert ticked.period == pytest.approx(1e-3, rel=0.1)
     np.testing.assert_allclose(ticked.estimate.z, true.estimate.z, atol=0.05)
     assert ticked.counters.spread_stamps > 9300

@@ -240,7 +240,8 @@ def clock(user):
 
 def test_node_clock_sampling_follows_simulated_time(clock, estimator):
     rig = estimator('/sim', **FED | LAX, use_sim_time=True, sampling='clock')
-    rig.listen()
+    rig.listen().send(0.2)
+    rig.wait_said('rejected a sample: nothing on /clock yet')
     replay = OnlineEstimator({'max_gap': 60.0})
 
     def at(now: int, y: float) -> None:

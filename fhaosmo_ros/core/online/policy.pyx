@@ -169,7 +169,7 @@ cdef class Policy:
         if self.settings.nominal:
             course.now += self.settings.period
             now = course.now
-        elif self.settings.by_clock:
+        elif self.settings.by_clock and stamp != 0:  # 0 is no tick: the clock is not known yet
             now = clock_time(&self.clock, stamp, self.max_gap(), &self.counters.spread_stamps)
         word = self.judge(stamp, now, y)
         if not word and not isnan(memory.y):

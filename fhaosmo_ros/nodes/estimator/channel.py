@@ -32,8 +32,8 @@ TOLD = {
     Status.RESTARTED: 'the stamps jumped by more than max_gap, ahead or back: restarted from the '
     'new one ({restarts} restarts so far); where y always comes so slowly, set max_gap to several '
     'of its periods',
-    Status.DIVERGED: 'the observer had lost y and started again from it; its gains do not fit '
-    '({divergences} divergences so far)',
+    Status.DIVERGED: 'the observer had lost y and started again from it; its gains or its model '
+    'do not fit ({divergences} divergences so far)',
     Status.JUMPED: 'y jumped; {jumped} ({jumps} jumps so far)',
     Status.HELD: 'its stamp lies more than max_gap from the one before; the next one decides',
     Status.REJECTED_PERIOD: '{late}',
@@ -224,7 +224,9 @@ class Channel:
         self._quiet_until[flag] = now + QUIET
         counters, offset = self.estimator.counters, self.estimator.offset
         late = 'expected a stamp later than the one before'
-        if not stamp and not self._by_clock:
+        if not stamp and self._by_clock:
+            late = 'nothing on /clock yet'
+        elif not stamp:
             hint = '; input_stamp: source does without it' if self.y.stamps == 'header' else ''
             late = f'its {self.y.stamps} stamp is 0: nobody fills it{hint}'
         jumped = 'z1 follows it, the other estimates go on'
