@@ -10,7 +10,7 @@ from fhaosmo_ros.nodes.middleware.messages import definitions
 from geometry_msgs.msg import AccelStamped, Quaternion, WrenchStamped
 import numpy as np
 import pytest
-from running import as_time, FED, joint_state, nanoseconds, SECOND, STALE, User, WARN
+from running import as_time, ERROR, FED, joint_state, nanoseconds, SECOND, STALE, User, WARN
 from sensor_msgs.msg import Imu, JointState
 from std_msgs.msg import ByteMultiArray, Float64, Header
 
@@ -25,7 +25,7 @@ def test_bad_messages_are_told_counted_and_survived(user, estimator):
     with User('other') as other:  # one participant has one type of a topic
         other.node.create_publisher(Float64, '/bad/data', 10)
         for _ in range(2):
-            rig.wait_status('input', STALE, "field 'position[elbow]': expected a number in")
+            rig.wait_status('input', ERROR, "field 'position[elbow]': expected a number in")
         assert len(rig.said('expected a number in')) == 1
     data = user.publisher('/bad/data', JointState)  # of a type that has the field
     data.publish(joint_state(SECOND, ['elbow'], [0.2]))

@@ -133,7 +133,7 @@ class Health:
         report.find(ERROR, y.error, y.error)
         for text in source.unheard.values():
             report.find(WARN if heard else ERROR, text)
-        silence = ERROR if source.unheard and not heard else STALE
+        silence = ERROR if y.error or (source.unheard and not heard) else STALE
         since = f'for {age:.3g} s' if age == age else 'yet'
         report.find(silence, f'no usable sample {since}', seen.stale)
         alone = f'no publisher of {source.topic} that can be heard'
