@@ -129,7 +129,7 @@ class Pairing:
         An input is by its header's stamp; else none has to be paired.
     late, ahead : int
         Inputs that came after their sample had been released; samples that were released when
-        all of an input's stamps were later than theirs.
+        all of an input's stamps were later than theirs, or the next one by more than max_gap.
 
     """
 
@@ -191,7 +191,8 @@ class Pairing:
                 while coming and coming[0][0] <= stamp:
                     self._held[j] = coming.popleft()[1]
                     self._known.add(j)
-                self.ahead += bool(coming) and j not in self._known
+                if coming and (j not in self._known or coming[0][0] - stamp > self._max_gap):
+                    self.ahead += 1
                 u[j] = self._held[j]
             self._done = stamp
             yield sample, u

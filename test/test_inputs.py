@@ -114,9 +114,11 @@ def test_without_a_wait_the_newest_that_is_there_acts_and_late_ones_are_counted(
     events = [
         (1, 0, 20 * MS, 2.0), (2, 'y', 10 * MS, 'a'), (3, 'y', 20 * MS, 'b'),
         (4, 'y', 30 * MS, 'c'), (5, 0, 30 * MS, 3.0), (6, 'y', 40 * MS, 'd'),
+        (7, 0, 541 * MS, 4.0), (8, 'y', 40 * MS, 'e'), (9, 'y', 41 * MS, 'f'),  # its clock jumps
     ]  # fmt: skip
-    assert fed(pairing, events) == [('a', [7.0]), ('b', [2.0]), ('c', [2.0]), ('d', [3.0])]
-    assert (pairing.late, pairing.ahead) == (1, 1)
+    inputs = [7.0, 2.0, 2.0, 3.0, 3.0, 3.0]
+    assert fed(pairing, events) == [(y, [u]) for y, u in zip('abcdef', inputs, strict=True)]
+    assert (pairing.late, pairing.ahead) == (1, 2)
 
 
 def test_input_without_stamp_or_by_reception_holds_from_its_arrival_on():
