@@ -15,6 +15,7 @@ import os
 from pathlib import Path
 import signal
 import sys
+import warnings
 
 from fhaosmo_ros import __version__
 from fhaosmo_ros.commands import COMMANDS
@@ -57,6 +58,14 @@ def run(name: str, arguments: list[str] | None = None) -> int:
     code = 0 if COMMANDS[name][0].startswith('fhaosmo_ros.nodes.') else 130
     for number in ending_signals():
         signal.signal(number, lambda *_: os._exit(code))
+    told: set[str] = set()
+
+    def tell(warning: Warning | str, *_: object) -> None:
+        if str(warning) not in told:
+            told.add(str(warning))
+            print(f'{name}: warning: {warning}', file=sys.stderr)
+
+    warnings.showwarning = tell  # a line, once; Python's has a path of the package, too
     try:
         # Imported only now: a node needs ROS, and the help must not wait for numpy.
         gc.disable()  # nearly all that an import makes stays; looking for garbage takes 0.1 s

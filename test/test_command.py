@@ -2,6 +2,7 @@
 """The protocol of all commands: exit codes, one-line errors, signals, outputs, processes."""
 
 import argparse
+from errno import ENOSPC
 import os
 from pathlib import Path
 import signal
@@ -88,6 +89,8 @@ def test_output_replaces_only_what_is_empty_or_forced_and_only_when_it_is_comple
     assert final.read_text() == 'newer'
     with pytest.raises(ConfigurationError, match='--force'), Output(final):
         pass
+    with pytest.raises(ConfigurationError, match='No space left'), Output(final, force=True):
+        raise OSError(ENOSPC, 'No space left on device')
     assert [p.name for p in tmp_path.iterdir()] == ['out']
     with pytest.raises(ConfigurationError, match='a folder that is in use'):
         Output(Path('..'), force=True)
@@ -122,13 +125,16 @@ raise SystemExit(main(['slow']))
 """
 LOADS = 'import time\nprint("begun", flush=True)\ntime.sleep(600)\n'
 WORKS = """
-import argparse, time
+import argparse, time, warnings
 from pathlib import Path
 from fhaosmo_ros.tools.cli.command import Output, run_command
 
 def body(arguments, stop):
     with Output(Path(__file__).with_name('out')) as output, stop.raising():
         output.path.mkdir()
+        warnings.filterwarnings('always', 'odd')
+        for _ in range(2):
+            warnings.warn('odd')
         print('begun', flush=True)
         time.sleep(600)
 
@@ -151,7 +157,8 @@ def test_signal_ends_a_command_that_loads_or_works(begin, tmp_path, module, numb
     assert process.stdout.readline() == 'begun\n'
     process.send_signal(number)
     _, error = process.communicate(timeout=60)
-    assert (process.returncode, error) == (130, '' if module == LOADS else 'slow: interrupted\n')
+    said = '' if module == LOADS else 'slow: warning: odd\nslow: interrupted\n'
+    assert (process.returncode, error) == (130, said)
     assert {p.name for p in tmp_path.iterdir()} <= {'slow.py', '__pycache__'}
 
 

@@ -26,7 +26,8 @@ WRONG = {
     'replay bag --columns t,y': ['--columns: expected a .csv file, got'],
     # Tables.
     f'{TABLE} text.csv': ['text.csv: expected lines of numbers: could not convert str'],
-    f'{TABLE} none.csv': ['--columns: expected 3 titles, of the time, y, torque, got'],
+    f'{TABLE} none.csv': ['none.csv: expected lines of numbers, got an empty file'],
+    f'{TABLE} late.csv --columns t,u': ['expected 3 titles, of the time, y, torque, got t, u'],
     f'{TABLE} late.csv --columns t,anlge,u': ["t, angle, u, got 'anlge'; did you mean 'angle'?"],
     f'{TABLE} late.csv': ['late.csv: expected times of 0 to 9.2e+09 s, got nan in sample 0'],
     # Parameters.

@@ -3,6 +3,7 @@
 
 import argparse
 from collections.abc import Callable, Sequence
+from errno import EDQUOT, ENOSPC
 from functools import partial
 import os
 from pathlib import Path
@@ -125,10 +126,12 @@ class Output:
             shutil.rmtree(self._folder, ignore_errors=True)  # of a run that was killed
             self._folder.mkdir(parents=True)
         except OSError as error:
-            raise ConfigurationError(
-                f'output {final}: expected a place that can be written, got: {error.strerror}'
-            ) from None
+            raise self._unwritable(error) from None
         return self
+
+    def _unwritable(self, error: OSError) -> ConfigurationError:
+        problem = f'expected a place that can be written, got: {error.strerror}'
+        return ConfigurationError(f'output {self._final}: {problem}')
 
     def keep(self) -> Path:
         """Give it its final name and return that."""
@@ -136,8 +139,10 @@ class Output:
             self._final.rename(self._folder / 'replaced')
         return self.path.rename(self._final)
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, _: object, error: BaseException | None, __: object) -> None:
         shutil.rmtree(self._folder, ignore_errors=True)
+        if isinstance(error, OSError) and error.errno in (ENOSPC, EDQUOT):  # names no file
+            raise self._unwritable(error) from None
 
 
 def shipped(relative: str) -> Path:
