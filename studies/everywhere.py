@@ -11,7 +11,7 @@ import math
 import sys
 from typing import NamedTuple
 
-from fhaosmo_ros.core import ConfigurationError, Recording, TriangularModel
+from fhaosmo_ros.core import Recording, TriangularModel
 from fhaosmo_ros.core.parameters.files import load
 from fhaosmo_ros.core.parameters.tables import ONLINE_PARAMETERS
 from fhaosmo_ros.core.simulation.plant import quantised, respond
@@ -30,6 +30,7 @@ from studies.methods import (
     NOISE,
     objective,
     Setting,
+    trial,
     tune,
     Values,
 )
@@ -162,15 +163,6 @@ def setting_of(plant: Plant, c: Condition) -> Setting:
     return Setting(TriangularModel(told), 1.0 / c.rate, plant.size, plant.noise)
 
 
-def error_of(values: Values, setting: Setting, recordings: list[Recording]) -> float:
-    """Return the mean error of a Kalman filter; infinite where it does not exist."""
-    try:
-        run = METHODS[LINEAR_LIMIT].prepare(setting, values)
-    except ConfigurationError:
-        return math.inf
-    return mean(objective(r, run(r)[:, -1]) for r in recordings)
-
-
 def implied(plant: Plant, c: Condition, recordings: list[Recording]) -> float:
     """Return the error of the d that a wrong Phi implies, where every z is known exactly."""
     phi = TriangularModel(plant.phi)
@@ -204,21 +196,20 @@ def cell(name: str, condition: str, size: Size, once: Values | None) -> tuple[Ro
     plant, c = PLANTS[name], CONDITIONS[condition]
     recordings = [recording(plant, c, kind, size.duration) for kind in size.kinds]
     setting = setting_of(plant, c)
-    anew = tune(METHODS[LINEAR_LIMIT], setting, recordings, size.trials, SEED).values
-    once = once or anew
+    anew = tune(METHODS[LINEAR_LIMIT], setting, recordings, size.trials, SEED)
+    once = once or anew.values
     values = at(once, setting.model.order, c.rate)
     preset = load(shipped(plant.file), 'estimator', ONLINE_PARAMETERS) | setting.told
     of_preset = (objective(r, observed(preset, r.t, r.y).unknown_input) for r in recordings)
     ours = self_tuned(setting, recordings)
     found = {
         SELF: mean(ours.errors),
-        ONCE: error_of(values, setting, recordings),
+        ONCE: trial(METHODS[LINEAR_LIMIT], setting, values, recordings).value,
         PRESET: mean(of_preset),
     }
-    yard = error_of(anew, setting, recordings)
-    row: Row = {'plant': name, 'condition': condition, ANEW: yard}
-    row |= {method: value / yard for method, value in found.items()}
-    row[KNOWN] = implied(plant, c, recordings) / yard if c.phi != 1.0 else None
+    row: Row = {'plant': name, 'condition': condition, ANEW: anew.value}
+    row |= {method: value / anew.value for method, value in found.items()}
+    row[KNOWN] = implied(plant, c, recordings) / anew.value if c.phi != 1.0 else None
     row['inside 1 σ'], row['inside 1.96 σ'] = (round(share, 3) for share in ours.inside)
     return row, once
 

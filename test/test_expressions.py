@@ -103,16 +103,6 @@ def test_named_inputs_and_constants_stand_for_their_values():
     np.testing.assert_allclose(model.jacobian(z, [torque, load])[1], [-9.81 * np.cos(0.3), -0.25])
 
 
-def test_a_constant_changes_live():
-    names = Observer(MOTOR | {'gains': 'fixed'})
-    names.configure({'constants.b': 0.9})
-    np.testing.assert_allclose(names.model.jacobian(np.zeros(2), [0.0, 0.0])[1], [-9.81, -0.45])
-    for bad in ({'constants.m': np.nan}, {'constants.q': 1.0}):
-        with pytest.raises(ConfigurationError, match=next(iter(bad))):
-            names.configure(bad)
-    assert names.parameters['constants.m'] == 2.0
-
-
 @pytest.mark.parametrize(('changes', 'said'), [
     ({'phi': ['0', 'torqe']}, "did you mean 'torque'"), ({'phi': ['0', 'g']}, "'constants.g'"),
     *(({'inputs': [name, 'torque', 'load']}, said) for name, said in (

@@ -132,6 +132,4 @@ def test_last_width_and_system_serve_the_levels_that_follow():
     found = law((0.1, 0.4)).configuration
     np.testing.assert_array_equal(found.widths, [0.1, 0.4, 0.4, 0.4])
     np.testing.assert_array_equal(found.curves, [curve(f'terms {k}') for k in (5, 7, 7, 7)])
-    with pytest.raises(ConfigurationError, match='1 to 4 values'):
-        law(fuzzy_systems=['terms 5'] * 5)
     assert law(order=1, phi=['0'], unknown_input=False).levels == 1  # the default is not too long

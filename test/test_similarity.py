@@ -3,8 +3,8 @@
 y in another unit, time in another unit: the same estimate in those units.
 
 z_i' = z_{i+1} + Phi_i keeps its form if y is scaled by a, time by b, and z_i by a b^-(i-1). A
-self-tuning observer is told nothing but Phi, so it has to give the same estimate: to the bit where
-a and b are powers of two, else to rounding. The same holds for what the policy does with gaps,
+self-tuning observer is told nothing but Phi, so it has to give the same estimate: to the bit, as a
+and b are powers of two here. The same holds for what the policy does with gaps,
 stamps that are late or far away, bad values and a sensor that is stuck.
 """
 
@@ -49,15 +49,6 @@ def in_units(a, b, order):
 ])  # fmt: skip
 def test_powers_of_two_change_no_bit(order, a, b):
     np.testing.assert_array_equal(in_units(a, b, order), in_units(1.0, 1.0, order))
-
-
-@pytest.mark.parametrize(('a', 'b'), [(1e-6, 1e6), (1e6, 1e-6), (1e6, 1e6), (1e-6, 1e-6)])
-def test_other_units_change_no_more_than_rounding_does(a, b):
-    found, wanted = in_units(a, b, 2), in_units(1.0, 1.0, 2)
-    known = np.isfinite(wanted).all(axis=1)
-    np.testing.assert_array_equal(np.isfinite(found).all(axis=1), known)
-    size = np.sqrt(np.mean(wanted[known] ** 2, axis=0))
-    assert (np.abs(found[known] - wanted[known]) / size).max() < 1e-6
 
 
 @pytest.mark.parametrize('order', [2, 4])
