@@ -15,6 +15,7 @@ import os
 from pathlib import Path
 import signal
 import sys
+from typing import Any
 import warnings
 
 from fhaosmo_ros import __version__
@@ -59,13 +60,16 @@ def run(name: str, arguments: list[str] | None = None) -> int:
     for number in ending_signals():
         signal.signal(number, lambda *_: os._exit(code))
     told: set[str] = set()
+    usual = warnings.showwarning
 
-    def tell(warning: Warning | str, *_: object) -> None:
-        if str(warning) not in told:
+    def tell(warning: Warning | str, category: type[Warning], *place: Any) -> None:
+        if category is not UserWarning:
+            usual(warning, category, *place)
+        elif str(warning) not in told:
             told.add(str(warning))
             print(f'{name}: warning: {warning}', file=sys.stderr)
 
-    warnings.showwarning = tell  # a line, once; Python's has a path of the package, too
+    warnings.showwarning = tell  # ours in a line, once; Python's way has a path in the package
     try:
         # Imported only now: a node needs ROS, and the help must not wait for numpy.
         gc.disable()  # nearly all that an import makes stays; looking for garbage takes 0.1 s

@@ -53,6 +53,7 @@ WRONG = {
     "record -o out --topics 'a b'": ['--topics', "'a b'"],
     'record -o out --topics /nobody --duration 0.5': ['nothing was published'],
     'record -o bag': ['one that exists'],
+    'record -o out --ros-args -p use_sim_time:=1': ["'use_sim_time' to '1'"],
     'demo --output out --duration 0': ['--duration', '1 to 3600', '0'],
     'demo --output out --params-file phi.yaml': ["'phi': expected 3 expressions"],
     'demo --output bag': ['bag', '--force'],

@@ -16,6 +16,7 @@ from fhaosmo_ros.nodes.middleware.spin import GRACE, Spinner
 from fhaosmo_ros.topics import OF_ALL_NODES
 import rclpy
 from rclpy.context import Context
+from rclpy.exceptions import ParameterException
 from rclpy.node import Node, NodeNameNonExistentError
 from rclpy.parameter import Parameter
 from rclpy.parameter_client import AsyncParameterClient
@@ -53,7 +54,7 @@ class PrivateNode(Spinner):
         try:
             rclpy.init(args=given, context=self._context, signal_handler_options=no_handlers)
             self.node = Node(name, context=self._context)
-        except RuntimeError as error:
+        except (RuntimeError, ParameterException) as error:
             raise ConfigurationError(f'ROS arguments {shlex.join(given)}: {error}') from None
         self._client = cache(partial(AsyncParameterClient, self.node))  # by the name of its node
         super().__init__(self.node, grace=grace)

@@ -6,7 +6,7 @@ from typing import Any
 
 from fhaosmo_ros.core.parameters.declaration import Parameter, Parameters, shown, suggestion, Value
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
-from fhaosmo_ros.core.parameters.files import is_built_in
+from fhaosmo_ros.core.parameters.files import BUILT_IN, is_built_in
 from fhaosmo_ros.core.parameters.per_channel import followers
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.exceptions import ParameterNotDeclaredException
@@ -64,8 +64,11 @@ def built_in(given: Mapping[str, Any]) -> list[RosParameter]:
     """Return those given parameters that are rclpy's own, such as use_sim_time."""
     own = {name: value for name, value in given.items() if is_built_in(name)}
     for name, value in own.items():
-        if not isinstance(value, bool | int | float | str):
-            raise ConfigurationError(f"parameter '{name}': expected one value, got {shown(value)}")
+        flag = name in BUILT_IN
+        if not isinstance(value, bool if flag else bool | int | float | str):
+            expected = 'true or false' if flag else 'one value'
+            problem = f'expected {expected}, got {shown(value)}'
+            raise ConfigurationError(f"parameter '{name}': {problem}")
     return [RosParameter(name, value=value) for name, value in own.items()]
 
 
