@@ -6,8 +6,10 @@ Message types are named as ROS names them, so that a tool without ROS can use th
 """
 
 from collections.abc import Mapping
+import re
 from typing import Any
 
+TOPIC_NAME = re.compile(r'/?[A-Za-z_]\w*(/[A-Za-z_]\w*)*', re.ASCII)
 FLOAT = 'std_msgs/msg/Float64'
 ARRAY = 'std_msgs/msg/Float64MultiArray'
 TEXT = 'std_msgs/msg/String'

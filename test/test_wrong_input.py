@@ -36,6 +36,7 @@ WRONG = {
     'replay bag -p input_stamp:=header': ['input_stamp header', files.FLOAT],
     'replay bag -p order=3': ['NAME:=VALUE', "'order=3'"],
     'replay bag --smooth': ["expected 'noise_size' > 0"],
+    "replay bag --name 'a b'": ["--name: expected a name such as /tuned, got 'a b'"],
     'replay bag --params-file lamda.yaml': ['error: lamda.yaml: ', "'lamda'", "mean 'lambda'"],
     'replay bag --params-file node.yaml': ["'estimator' or '/**'", 'got estimater'],
     # plot

@@ -12,7 +12,7 @@ from typing import Any
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.nodes.middleware.endpoints import subscribe_with_info
 from fhaosmo_ros.nodes.middleware.messages import message_class
-from fhaosmo_ros.nodes.middleware.spin import GRACE, Spinner
+from fhaosmo_ros.nodes.middleware.spin import GRACE, of_rcl, Spinner
 from fhaosmo_ros.topics import OF_ALL_NODES
 import rclpy
 from rclpy.context import Context
@@ -55,7 +55,8 @@ class PrivateNode(Spinner):
             rclpy.init(args=given, context=self._context, signal_handler_options=no_handlers)
             self.node = Node(name, context=self._context)
         except (RuntimeError, ParameterException) as error:
-            raise ConfigurationError(f'ROS arguments {shlex.join(given)}: {error}') from None
+            problem = of_rcl(error)
+            raise ConfigurationError(f'ROS arguments {shlex.join(given)}: {problem}') from None
         self._client = cache(partial(AsyncParameterClient, self.node))  # by the name of its node
         super().__init__(self.node, grace=grace)
 

@@ -4,7 +4,6 @@
 import argparse
 import math
 from pathlib import Path
-import re
 import shutil
 import sys
 import time
@@ -13,6 +12,7 @@ from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.stop_signals import Stop
 from fhaosmo_ros.tools.bags.writer import BagWriter
 from fhaosmo_ros.tools.cli.command import progress, run_command
+from fhaosmo_ros.topics import TOPIC_NAME
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -42,7 +42,7 @@ def _record(arguments: argparse.Namespace, stop: Stop) -> None:
         raise ConfigurationError(f'output {path}: expected a new name, got one that exists')
     topics = arguments.topics or []
     for topic in topics:
-        if not re.fullmatch(r'/?[A-Za-z_]\w*(/[A-Za-z_]\w*)*', topic):
+        if not TOPIC_NAME.fullmatch(topic):
             raise ConfigurationError(f'--topics: expected a name such as /y, got {topic!r}')
     # Here, so that --help needs no ROS.
     from fhaosmo_ros.nodes.recording import TopicRecorder

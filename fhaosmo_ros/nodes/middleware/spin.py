@@ -145,13 +145,19 @@ def run_node(name: str, factory: Callable[..., Node], argv: list[str] | None) ->
         return _refused(name, str(with_origin(error, origins)))
     except RuntimeError as error:  # rcl's
         unknown = 'unknown ROS arguments ' * (type(error).__name__ == 'UnknownROSArgsError')
-        return _refused(name, unknown + re.sub(r', at \S+:\d+', '', str(error)))
+        return _refused(name, unknown + of_rcl(error))
     finally:
         if node is not None:
             node.destroy_node()
         rclpy.try_shutdown()
         faulthandler.cancel_dump_traceback_later()
     return 0
+
+
+def of_rcl(error: Exception) -> str:
+    """Return what rcl says, without its places in C, and what to do where it has no folder."""
+    text = re.sub(r', at \S+:\d+', '', str(error))
+    return text + '; set HOME or ROS_LOG_DIR' * ('logging directory' in text)
 
 
 def _refused(name: str, text: str) -> int:

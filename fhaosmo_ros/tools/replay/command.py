@@ -25,7 +25,7 @@ from fhaosmo_ros.tools.cli.command import Output, run_command
 from fhaosmo_ros.tools.cli.options import add_parameter_options, channel_parameters, named
 from fhaosmo_ros.tools.replay.live_run import find_estimator, LiveRun
 from fhaosmo_ros.tools.replay.sinks import Rows, sink, TABLES
-from fhaosmo_ros.topics import ESTIMATES
+from fhaosmo_ros.topics import ESTIMATES, TOPIC_NAME
 import numpy as np
 from numpy.typing import NDArray
 
@@ -207,6 +207,8 @@ def _estimates(
 
 def _name(present: set[str], name: str | None) -> str:
     """Return the name below which the estimates' topics go."""
+    if name and not TOPIC_NAME.fullmatch(name.rstrip('/')):
+        raise ConfigurationError(f'--name: expected a name such as /tuned, got {name!r}')
     for candidate in [f'/{name.strip("/")}'] if name else ['/estimator', '/replay/estimator']:
         taken = present & {f'{candidate}/{part}' for part in ESTIMATES}
         if not taken:
