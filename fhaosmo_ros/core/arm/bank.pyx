@@ -64,7 +64,7 @@ cdef class Bank:
     cdef double[:, ::1] mass, middle
     cdef double[::1] drive, mean_drive
 
-    def __init__(
+    def __cinit__(
         self, free_intensity, double decay, scales, rates, double onset=0.0, double since=0.0,
         bint of_position=True,
     ):

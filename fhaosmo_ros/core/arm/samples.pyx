@@ -44,8 +44,8 @@ cdef class Noise:
     cdef double[:, :, ::1] before  # the three samples before
     cdef int seen, count
 
-    def __init__(self, size, least, most):
-        self.now, self.least, self.most = np.square(size), np.square(least), np.square(most)
+    def __cinit__(self, size, least, most):
+        self.now, self.least, self.most = np.square(np.broadcast_arrays(size, least, most))
         self.variance = np.asarray(self.now)
         self.before = np.zeros((3, *self.variance.shape))
         self.seen, self.count = 0, FIRST_LEARNT
@@ -100,7 +100,7 @@ cdef class Clock:
     cdef double[:, ::1] speeds  # at the sample before, by stamps and by even intervals
     cdef double rough_by_stamps, rough_by_even
 
-    def __init__(self):
+    def __cinit__(self):
         self.reset()
 
     def reset(self):
@@ -122,8 +122,10 @@ cdef class Clock:
         cdef double by_stamps = 0.0, by_even = 0.0, total = 0.0, along = 0.0, square = 0.0
         cdef double noise = 0.0, even, one, two
         cdef double told = h, sure = INFINITY  # time by the motion, and how exact it is (s)
-        cdef int k
-        for k in range(moved.shape[0]):
+        cdef Py_ssize_t k, n = moved.shape[0]
+        if not n == velocity.shape[0] == variance.shape[0]:
+            raise ValueError(f'expected arrays of {n} joints')
+        for k in range(n):
             total += moved[k] * moved[k]
             along += moved[k] * velocity[k]
             square += velocity[k] * velocity[k]
@@ -139,9 +141,9 @@ cdef class Clock:
                 even = h
             self.vague = fabs(even - told) / fmax(fabs(told), 1e-15)
             return even
-        if self.speeds is None:
+        if self.speeds is None or self.speeds.shape[1] != n:
             self.speeds = np.array([np.divide(moved, h), np.divide(moved, even)])
-        for k in range(moved.shape[0]):
+        for k in range(n):
             one, two = moved[k] / h, moved[k] / even
             by_stamps += (one - self.speeds[0, k]) * (one - self.speeds[0, k])
             by_even += (two - self.speeds[1, k]) * (two - self.speeds[1, k])
@@ -219,11 +221,14 @@ cdef class Samples:
     cdef int repeats  # samples in a row that a driver has published once more
     cdef long long time
 
-    def __init__(
-        self, Noise noise, lowest, highest, step, stopping, turning, double longest,
+    def __cinit__(
+        self, Noise noise not None, lowest, highest, step, stopping, turning, double longest,
         bint of_position,
     ):
-        n = len(step)
+        cdef Py_ssize_t n = len(step)
+        given = noise.variance, lowest, highest, step, stopping, turning
+        if [*map(np.shape, given)] != [(3, n)] * 3 + [(n,)] * 3:
+            raise ValueError(f'expected arrays of {n} joints')
         self.noise, self.clock = noise, Clock()
         self.longest, self.of_position = longest, of_position
         self.lowest, self.highest, self.step, self.stopping = lowest, highest, step, stopping
@@ -266,7 +271,10 @@ cdef class Samples:
 
     def between(self, const double[::1] before, const double[::1] after):
         """Return how far the joints have moved, (n,)."""
-        return np.array([self.shorter(k, after[k] - before[k]) for k in range(len(after))])
+        cdef Py_ssize_t k, n = self.step.shape[0]
+        if not n == before.shape[0] == after.shape[0]:
+            raise ValueError(f'expected arrays of {n} joints')
+        return np.array([self.shorter(k, after[k] - before[k]) for k in range(n)])
 
     def take(
         self, long long time, const double[:, ::1] sample, velocity, const double[::1] motion

@@ -21,6 +21,19 @@ cdef inline double sign_of(double a) noexcept nogil:
     return a if a == 0.0 or isnan(a) else copysign(1.0, a)
 
 
+cdef check(one, int states, int inputs):
+    """Raise ValueError unless operations can be evaluated: nothing else looks at them."""
+    depth = 0
+    for code, x in one:
+        depth += 1 if code <= INPUT else -1 if code <= MAX else 0
+        most = {STATE: states, INPUT: inputs}.get(code)
+        known = CONST <= code <= SIGN and 0 < depth <= MOST_OPERANDS
+        if not known or not (most is None or 0 <= x < most):
+            raise ValueError(f'expected operations in postfix order, got {one}')
+    if one and depth != 1:
+        raise ValueError(f'expected operations that leave one number, got {one}')
+
+
 cdef class Expressions:
     """
     Several expressions; immutable, so that threads can share it.
@@ -33,15 +46,18 @@ cdef class Expressions:
     states, inputs : int
         How many states and known inputs there are.
 
-    Notes
-    -----
-    Operations are as `expressions.parse` makes them, which bounds their number and operands.
+    Raises
+    ------
+    ValueError
+        Operations that lack operands, or that are more than an evaluation has room for.
 
     """
 
     def __cinit__(self, source, int states, int inputs):
         self.source = tuple(tuple((int(c), float(x)) for c, x in one) for one in source)
         self.count, self.states, self.inputs = len(self.source), states, inputs
+        for one in self.source:
+            check(one, states, inputs)
         code = [(c, 0 if c == CONST else x, x) for one in self.source for c, x in one]
         self.code = np.array([*code, (CONST, 0, 0.0)], dtype=INSTRUCTION)  # never empty
         self.offsets = np.cumsum([0, *map(len, self.source)], dtype=np.intc)
@@ -151,9 +167,9 @@ cdef class Expressions:
             Arrays that are too short.
 
         """
-        cdef double[::1] states = np.ascontiguousarray(z, dtype=np.float64)
-        cdef double[::1] tangent = np.ascontiguousarray(dz, dtype=np.float64)
-        cdef double[::1] inputs = np.ascontiguousarray(u, dtype=np.float64)
+        cdef const double[::1] states = np.ascontiguousarray(z, dtype=np.float64)
+        cdef const double[::1] tangent = np.ascontiguousarray(dz, dtype=np.float64)
+        cdef const double[::1] inputs = np.ascontiguousarray(u, dtype=np.float64)
         cdef double[:, ::1] found = np.empty((2, self.count))
         cdef Dual phi
         cdef int i

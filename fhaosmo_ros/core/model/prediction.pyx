@@ -61,7 +61,7 @@ cdef class Prediction(Dynamics):
     """
 
     def __cinit__(self, Expressions phi not None, double longest):
-        if phi.count > MOST_LEVELS:
+        if not phi.states <= phi.count <= MOST_LEVELS:
             raise ValueError(f'expected at most {MOST_LEVELS} states, got {phi.count}')
         self.phi, self.n, self.longest = phi, phi.count, longest
         self.size = 2 * self.n

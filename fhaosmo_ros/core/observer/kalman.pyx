@@ -31,16 +31,20 @@ DOUBLINGS = 60
 
 
 cdef fill(Row* to, matrix):
-    """Copy an (N, N) array; N is at most `MOST_LEVELS`."""
-    cdef int i, j
-    for i, row in enumerate(matrix.tolist()):
-        for j, number in enumerate(row):
-            to[i][j] = number
+    """Copy an (N, N) array; raise ValueError if N is more than `MOST_LEVELS`."""
+    cdef const double[:, :] numbers = np.asarray(matrix, dtype=np.float64)
+    cdef Py_ssize_t i, j, n = numbers.shape[0]
+    if n > MOST_LEVELS or numbers.shape[1] != n:
+        raise ValueError(f'expected at most {MOST_LEVELS} states, got {np.shape(matrix)}')
+    for i in range(n):
+        for j in range(n):
+            to[i][j] = numbers[i, j]
 
 
 cdef int sub_steps(double h, double fastest) noexcept nogil:
     """Return in how many steps a covariance goes over `h`."""
-    return <int>max(min(ceil(h * fastest / STEP), MOST_STEPS), 1.0)
+    cdef double count = ceil(h * fastest / STEP)
+    return <int>min(count, MOST_STEPS) if count > 1.0 else 1  # also for NaN
 
 
 cdef void multiply(int n, const Row* f, Row* p) noexcept nogil:
@@ -106,10 +110,8 @@ cdef class LinearModel:
     """
 
     def __cinit__(self, rates, double intensity):
-        self.n, self.intensity = len(rates), intensity
-        if self.n > MOST_LEVELS:
-            raise ValueError(f'expected at most {MOST_LEVELS} states, got {self.n}')
         fill(self.rates, rates)
+        self.n, self.intensity = len(rates), intensity
         self.fastest = np.abs(np.linalg.eigvals(rates)).max()
 
     def __reduce__(self):
@@ -259,7 +261,7 @@ def stationary(chain, intensity):
     return np.linalg.solve(whole, drive).reshape(size, size)
 
 
-def innovations(Prediction prediction, samples, linear):
+def innovations(Prediction prediction not None, samples, linear):
     """
     Run the filter of one model of d along a recorded y (D 30).
 
@@ -308,6 +310,7 @@ def innovations(Prediction prediction, samples, linear):
     cdef int i, j
     if n > MOST_LEVELS or u.shape[1] < max(prediction.phi.inputs, 1) or not (
         h.shape[0] == u.shape[0] == periods.shape[0] == used.shape[0] == count
+        and np.shape(linear.a) == np.shape(linear.q) == np.shape(linear.fresh) == (n, n)
     ):
         raise ValueError('innovations: arrays of sizes that do not fit')
     fill(a, linear.a)

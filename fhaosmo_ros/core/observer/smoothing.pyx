@@ -126,8 +126,7 @@ cdef class Passes:
 
     def forward(self, rows, Py_ssize_t begin):
         """Go forward through the rows from `begin` on (D 24)."""
-        cdef unsigned char[::1] numbers = rows.view(np.uint8)
-        cdef Point* point = <Point*>&numbers[0]
+        cdef Point* point = points(rows, begin, len(rows))
         cdef Py_ssize_t k
         for k in range(begin, len(rows)):
             self.take(point + k - 1 if k > 0 else NULL, point + k)
@@ -357,8 +356,7 @@ cdef class Passes:
             With the variances of their errors, for a self-tuning observer.
 
         """
-        cdef unsigned char[::1] numbers = rows.view(np.uint8)
-        cdef const Point* point = <Point*>&numbers[0]
+        cdef const Point* point = points(rows, begin, end)
         cdef Py_ssize_t due = begin, done = begin, count = len(rows), k
         cdef bint whole = lag is None
         cdef long long age = 0 if whole else lag
@@ -379,15 +377,24 @@ cdef class Passes:
 
     def settled(self, rows, Py_ssize_t begin):
         """Return up to which row from `begin` on samples to come change `TOLERANCE` at most."""
-        cdef unsigned char[::1] numbers = rows.view(np.uint8)
         cdef Py_ssize_t count = len(rows)
+        cdef const Point* point = points(rows, begin, count)
         cdef double[:, :, ::1] out = np.empty((count - begin, 1 + self.tunes, self.n))
-        self.go_back(<Point*>&numbers[0], count - 1, begin, count, 1.0, out)
+        self.go_back(point, count - 1, begin, count, 1.0, out)
         waiting = rows[begin:]
         x, p = waiting['x'][:, :self.n], waiting['p'].diagonal(0, 1, 2)[:, :self.n]
         change, allowed = np.abs(np.asarray(out)[:, 0] - x), TOLERANCE * np.sqrt(np.abs(p))
         is_open = (change > allowed + ROUNDING * np.abs(x)).any(axis=1)
         return begin + np.argmax(np.append(is_open, True))
+
+
+cdef Point* points(rows, Py_ssize_t begin, Py_ssize_t end) except NULL:
+    """Return where rows lie; raise ValueError where those from `begin` to `end` are none."""
+    cdef unsigned char[::1] numbers
+    if rows.dtype != POINT or rows.ndim != 1 or not 0 <= begin <= end <= len(rows) > 0:
+        raise ValueError(f'smoothing: expected rows, and some from {begin} to {end} of them')
+    numbers = rows.view(np.uint8)
+    return <Point*>&numbers[0]
 
 
 cdef double usual(const Point* now, int i, int j) noexcept nogil:

@@ -33,7 +33,7 @@ cdef class Disturbance:
 
     """
 
-    def __init__(self, p, values=None, double spacing=1.0):
+    def __cinit__(self, p, values=None, double spacing=1.0):
         self.arguments, self.spacing = (p, values, spacing), spacing
         if values is not None:
             self.kind, self.values = TABLE, np.array(values, dtype=np.float64)
@@ -101,10 +101,10 @@ cdef class System(Dynamics):
 
     """
 
-    def __init__(self, Expressions phi not None, Disturbance d not None, double h, z):
+    def __cinit__(self, Expressions phi not None, Disturbance d not None, double h, z):
         cdef int i
         self.size, self.h = phi.count, h
-        if self.size > MOST_LEVELS or len(z) != self.size or not h > 0.0:
+        if phi.states > self.size or self.size > MOST_LEVELS or len(z) != self.size or not h > 0.0:
             raise ValueError(f'expected {phi.count} <= {MOST_LEVELS} states and a step > 0')
         self.phi, self.d = phi, d
         self.held = np.zeros(max(phi.inputs, 1))
@@ -119,9 +119,9 @@ cdef class System(Dynamics):
         self.taken, self.on_grid, self.z = values['taken'], values['on_grid'], values['z']
 
     def change(self, Expressions phi not None, Disturbance d not None):
-        """Go on with other functions of as many states."""
-        if phi.count != self.size:
-            raise ValueError(f'expected {self.size} states, got {phi.count}')
+        """Go on with other functions of as many states and known inputs."""
+        if phi.count != self.size or phi.states > self.size or phi.inputs != self.phi.inputs:
+            raise ValueError(f'expected {self.size} states, and {self.phi.inputs} known inputs')
         self.phi, self.d = phi, d
 
     @property
@@ -175,11 +175,13 @@ cdef class System(Dynamics):
 
         """
         cdef const double[::1] times = np.ascontiguousarray(t, dtype=np.float64)
-        cdef const double[:, ::1] inputs = u if u.shape[1] else np.zeros((len(u), 1))
+        cdef const double[:, ::1] inputs = u
         cdef Py_ssize_t k, count = times.shape[0]
         cdef double[:, ::1] states = np.empty((count, self.size))
-        if u.shape[0] != count or u.shape[1] < self.phi.inputs:
-            raise ValueError(f'expected known inputs of shape ({count}, m), got {u.shape}')
+        if inputs.shape[0] != count or inputs.shape[1] < self.phi.inputs:
+            raise ValueError(f'expected known inputs of shape ({count}, m), got {np.shape(u)}')
+        if inputs.shape[1] == 0:
+            inputs = np.zeros((count, 1))
         if not np.isfinite(times).all():
             raise ConfigurationError('plant: expected finite times, got some that are not')
         for k in range(count):
