@@ -54,6 +54,17 @@ def checked(values: Mapping[str, Any], like: Mapping[str, Any]) -> dict[str, Any
     return found
 
 
+def bounded(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return numbers and arrays as `checked` takes them: those that have overflowed, at an end."""
+    found: dict[str, Any] = {}
+    for name, value in values.items():
+        array = np.asarray(value)
+        known = array if name == 'y' else np.nan_to_num(array, posinf=math.inf, neginf=-math.inf)
+        clipped = np.clip(known, *RANGES.get(name, FINITE))
+        found[name] = clipped if array.ndim else float(clipped)
+    return found
+
+
 def array_of(
     values: Mapping[str, Any],
     name: str,

@@ -110,9 +110,9 @@ cdef class SlidingMode(Structure):
         if not self.sensitive:
             for i in range(self.levels):
                 self.level[i].p = self.level[i].q = 0.0
-        if not self.scheduled and self.memory.offset != 0.0:
+        if not (self.scheduled and self.predicting):  # nothing looks for a y that is off
             self.memory.y += self.memory.offset
-            self.memory.offset = self.memory.jumps = 0.0
+            self.memory.beyond = self.memory.offset = self.memory.jumps = 0.0
 
     cdef void advance(self, double y, double h, const double* u) noexcept nogil:
         self.loss = self.gradient = 0.0

@@ -18,7 +18,7 @@ from fhaosmo_ros.core.observer.status cimport (
 )
 
 from fhaosmo_ros.core.model.inputs import known_inputs
-from fhaosmo_ros.core.observer.numbers import checked
+from fhaosmo_ros.core.observer.numbers import bounded, checked
 from fhaosmo_ros.core.observer.status import Status
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 import numpy as np
@@ -366,7 +366,8 @@ cdef class Structure:
         cdef dict memory = self.memory
         self.enter()
         found = {name: np.array([level[name] for level in levels[:n]]) for name in OF_LEVELS}
-        return found | {'covariance': np.array(self.covariance)[:n, :n].copy()} | memory
+        found['covariance'] = np.array(self.covariance)[:n, :n]
+        return bounded(found | memory)
 
     def load_state_dict(self, values):
         """

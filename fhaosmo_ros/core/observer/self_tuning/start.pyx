@@ -30,7 +30,7 @@ cdef void gather(Members* m) noexcept nogil:
     """
     cdef Shared* shared = &m.shared
     cdef double y = m.work.sample.y, largest = 0.0
-    cdef int count = max(shared.samples, 1), i
+    cdef int count = min(max(shared.samples, 1), FIRST_SAMPLES - 1), i
     if count == 1:
         m.first_y[0], m.first_h[0] = m.work.sample.before, 0.0
     if count > 1 or fabs(y - m.first_y[0]) > ROUNDED * fabs(y):
