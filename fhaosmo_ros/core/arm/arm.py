@@ -4,7 +4,8 @@
 from collections import Counter, deque
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from threading import RLock
+from typing import Any, NamedTuple, NoReturn
 
 from fhaosmo_ros.core.arm.bank import Bank
 from fhaosmo_ros.core.arm.calibration import Calibration
@@ -132,6 +133,7 @@ class Arm:
         if calibration is None and p['calibration_file']:
             calibration = Calibration.loads(text_of(p, 'calibration_file', 'a YAML file'))
         self._calibrated = calibration is not None
+        self._alone = RLock()  # a second thread waits
         known = self.calibration = calibration or Calibration.of_urdf(model)
         if known.joints != model.joints:
             raise ConfigurationError(
@@ -174,6 +176,9 @@ class Arm:
         self._newest: int | None = None  # stamp
         self.reset()
 
+    def __reduce__(self) -> NoReturn:
+        raise TypeError('an Arm can not be copied or pickled: make another one')
+
     def _values(self, name: str) -> Floats:
         """Return a parameter that has one value, or one for each joint."""
         given, n = self.parameters[name], len(self.joints)
@@ -188,26 +193,29 @@ class Arm:
 
     def reset(self) -> None:
         """Begin anew with the next sample."""
-        self._waiting: deque[tuple[int, int, Floats]] = deque()  # stamps, times and samples
-        self._entrance = Clock()  # of samples that wait until their effort has come
-        self._velocity: Floats | None = None  # estimated
-        self._contact = False
-        self._looked, self._evidence = 0, self._rest  # stamp, and log-likelihood of each link
-        self.doubts = Doubts(self.model, self._with_gravity, np.sqrt(self._model_variance))
-        self._samples.reset()
+        with self._alone:
+            self._waiting: deque[tuple[int, int, Floats]] = deque()  # stamps, times and samples
+            self._entrance = Clock()  # of samples that wait until their effort has come
+            self._velocity: Floats | None = None  # estimated
+            self._contact = False
+            self._looked, self._evidence = 0, self._rest  # stamp, and log-likelihood of each link
+            self.doubts = Doubts(self.model, self._with_gravity, np.sqrt(self._model_variance))
+            self._samples.reset()
 
     def adopt(self, parameters: Parameters) -> None:
         """Go on with other live parameters; raise ConfigurationError for a bad payload."""
-        self.model.set_payload(payload_of(parameters))
+        with self._alone:
+            self.model.set_payload(payload_of(parameters))
         self.parameters = ARM_PARAMETERS.complete(parameters)
         rare = np.log(parameters['false_alarms_per_minute'])
         self._threshold = (self.calibration.log_odds or ODDS) - rare
 
     def tare(self) -> None:
         """Take the present external torque for zero from now on."""
-        now = self._bank.mean[2].copy()
-        self._tare += now
-        self._bank.shift(now)
+        with self._alone:
+            now = self._bank.mean[2].copy()
+            self._tare += now
+            self._bank.shift(now)
 
     def take(
         self, stamp: int, q: ArrayLike, effort: ArrayLike, velocity: ArrayLike | None = None
@@ -230,24 +238,25 @@ class Arm:
             None where there is none yet, or the sample was not used; `problem` says why.
 
         """
-        given = effort, q, self._rest if self._of_position else velocity
-        self.problem = ''
-        try:
-            sample = np.array(given, dtype=np.float64).reshape(3, len(self.joints))
-        except (TypeError, ValueError):
-            return self._refuse('wrong size')  # or no numbers
-        sample[0] *= self._constants
-        kind = self._samples.fault(sample)
-        if kind >= 0:
-            return self._refuse(FAULTS[kind] if np.isfinite(sample).all() else 'not finite')
-        if self._newest is not None and stamp <= self._newest:
-            if stamp > self._newest - MAX_GAP * 1e9:
-                return self._refuse('not newer')
-            self._refuse('clock set back')
-        self._newest = stamp
-        if self._delay:
-            return self._go_on_late(stamp, sample)
-        return self._go_on(stamp, stamp, sample)
+        with self._alone:
+            given = effort, q, self._rest if self._of_position else velocity
+            self.problem = ''
+            try:
+                sample = np.array(given, dtype=np.float64).reshape(3, len(self.joints))
+            except (TypeError, ValueError):
+                return self._refuse('wrong size')  # or no numbers
+            sample[0] *= self._constants
+            kind = self._samples.fault(sample)
+            if kind >= 0:
+                return self._refuse(FAULTS[kind] if np.isfinite(sample).all() else 'not finite')
+            if self._newest is not None and stamp <= self._newest:
+                if stamp > self._newest - MAX_GAP * 1e9:
+                    return self._refuse('not newer')
+                self._refuse('clock set back')
+            self._newest = stamp
+            if self._delay:
+                return self._go_on_late(stamp, sample)
+            return self._go_on(stamp, stamp, sample)
 
     def _refuse(self, problem: str) -> ArmEstimate | None:
         """Count a sample that is not used, and begin anew where that has to be."""

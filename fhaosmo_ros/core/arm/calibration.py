@@ -62,8 +62,9 @@ class Calibration:
             arrays = {name: np.array(v, dtype=np.float64) for name, v in given.items()}
             found = cls(joints, **arrays)
         except (yaml.YAMLError, TypeError, KeyError, ValueError) as error:
+            why = ' '.join(str(error).split())
             raise ConfigurationError(
-                f'calibration: expected a file of `calibrate`, got {text[:40]!r} ({error})'
+                f'calibration: expected a file of `calibrate`, got {text[:40]!r} ({why})'
             ) from None
         n = len(joints)
         shapes = {'inertial': (n, 10), 'coulomb': (n, len(WIDTHS)), 'log_odds': ()}

@@ -150,14 +150,15 @@ class OnlineEstimator:
     def adopt(self, change: Change) -> None:
         """Go on with a change that `prepare` has returned, from the next sample on."""
         (parameters, configuration), before = change, self._parameters
-        self.observer.adopt(configuration)
-        self.policy.configure(self.observer.structure, self._settings(parameters))
-        self._parameters = parameters
-        if self.smoothing is not None:
-            self.smoothing.configure()
-        self.events.configure(parameters)
-        if parameters['sampling'] != before['sampling']:  # stamps of another clock
-            self.policy.change(timed=False, tick_count=0)
+        with self.policy:
+            self.observer.adopt(configuration)
+            self.policy.configure(self.observer.structure, self._settings(parameters))
+            self._parameters = parameters
+            if self.smoothing is not None:
+                self.smoothing.configure()
+            self.events.configure(parameters)
+            if parameters['sampling'] != before['sampling']:  # stamps of another clock
+                self.policy.change(timed=False, tick_count=0)
 
     def configure(self, changes: Mapping[str, Any]) -> None:
         """
@@ -194,9 +195,10 @@ class OnlineEstimator:
 
     def reset(self) -> None:
         """Start afresh: the next sample is the first. Counters go on, and so does `freeze`."""
-        self.policy.reset()
-        self.events.reset()
-        self._cut()
+        with self.policy:
+            self.policy.reset()
+            self.events.reset()
+            self._cut()
 
     def smooth(self) -> None:
         """
@@ -218,7 +220,8 @@ class OnlineEstimator:
         """Return the smoothed estimates that still wait: nothing comes after them."""
         if self.smoothing is None:
             raise ConfigurationError('finish: expected smoothing_lag > 0, or a call of `smooth`')
-        return self.smoothing.finish()
+        with self.policy:
+            return self.smoothing.finish()
 
     @property
     def latest(self) -> int | None:
@@ -256,10 +259,11 @@ class OnlineEstimator:
                 'snapshot: expected that of an estimator with the same measurement_delay'
             )
         own, events = checked(values, own), checked(values, events)
-        self.observer.structure.load_state_dict(values)
-        self.policy.change(**own)
-        self.events.memory = Progress(**events)
-        self._cut()
+        with self.policy:
+            self.observer.structure.load_state_dict(values)
+            self.policy.change(**own)
+            self.events.memory = Progress(**events)
+            self._cut()
 
     def _cut(self) -> None:
         """Smooth nothing across what has happened."""
@@ -388,16 +392,17 @@ class OnlineEstimator:
 
     def _run(self, stamps: Ints, y: NDArray[np.float64], u: NDArray[np.float64]) -> Trajectory:
         """Take samples with their known inputs, and look at them for events and for smoothing."""
-        record, present, times, acting = self.policy.run(stamps, y, u)
-        found = Trajectory(stamps - self.policy.behind, **record.columns)
-        if self.events.on:
-            deviations = found.standard_deviation[:, -1] if self.observer.self_tuning else None
-            self.events.take(found.t, found.unknown_input, deviations, times, found.status)
-        if len(present):
-            found = found._replace(z=present[:, :-1], unknown_input=present[:, -1])
-        if self.smoothing is not None:
-            return self.smoothing.take(found, times, acting)
-        return found
+        with self.policy:
+            record, present, times, acting = self.policy.run(stamps, y, u)
+            found = Trajectory(stamps - self.policy.behind, **record.columns)
+            if self.events.on:
+                deviations = found.standard_deviation[:, -1] if self.observer.self_tuning else None
+                self.events.take(found.t, found.unknown_input, deviations, times, found.status)
+            if len(present):
+                found = found._replace(z=present[:, :-1], unknown_input=present[:, -1])
+            if self.smoothing is not None:
+                return self.smoothing.take(found, times, acting)
+            return found
 
     @property
     def estimate(self) -> Estimate | None:

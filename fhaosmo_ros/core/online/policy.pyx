@@ -9,6 +9,7 @@ the rules of time. A known input that arrives at t acted at t - `input_delay`. S
 sample needs the inputs that arrived a lag of measurement_delay - input_delay before it.
 """
 
+from cpython.pythread cimport PyThread_get_thread_ident
 from libc.math cimport fabs, fmax, fmin, isfinite, isnan, rint
 from libc.string cimport memcpy
 
@@ -120,6 +121,10 @@ cdef class Policy:
     settings : dict
         Values of `Settings`.
 
+    Notes
+    -----
+    In a ``with`` statement a thread has it for itself: another one gets a RuntimeError.
+
     """
 
     cdef readonly Structure structure  # the observer; another one after a live change
@@ -134,6 +139,7 @@ cdef class Policy:
     cdef readonly dict arrays  # by their names in a snapshot
     cdef double[::1] held, present
     cdef double[:, ::1] pieces
+    cdef unsigned long owner  # thread that has it for itself; 0: none
     cdef double acting[MOST_INPUTS]  # in the latest step; a mean where y is known later
 
     def __cinit__(self, Structure structure not None, dict settings):
@@ -154,9 +160,22 @@ cdef class Policy:
         ):
             raise ValueError('policy: expected an observer and a past of the same known inputs')
         if self.structure is not None:
-            self.structure.enter()
+            self.enter()
         self.structure, self.settings = structure, new
         self.tuner = structure if isinstance(structure, SelfTuning) else None
+
+    def __enter__(self):
+        self.enter()
+        self.owner = PyThread_get_thread_ident()
+
+    def __exit__(self, *_):
+        self.owner = 0
+
+    cdef void enter(self) except *:
+        """Raise RuntimeError while another thread uses this, or the observer."""
+        if self.owner != 0 and self.owner != PyThread_get_thread_ident():
+            raise RuntimeError('this estimator is in use by another thread: give each its own')
+        self.structure.enter()
 
     # One sample
 
@@ -584,7 +603,7 @@ cdef class Policy:
 
     def advance(self, long long stamp, double y):
         """Take a sample with the known inputs that are held; return the status word."""
-        self.structure.enter()
+        self.enter()
         return self.take(stamp, y, &self.held[0])
 
     def run(self, const long long[::1] stamps, const double[::1] y, const double[:, ::1] u):
@@ -601,7 +620,7 @@ cdef class Policy:
         cdef double[:, ::1] present = np.empty((count * carried, structure.order + 1))
         cdef long long[::1] times = np.empty(count, dtype=np.int64)
         cdef double[:, ::1] acting = np.empty((count, m))
-        structure.enter()
+        self.enter()
         if not (stamps.shape[0] == u.shape[0] == count and u.shape[1] == m):
             raise ValueError('run: arrays of different lengths')
         structure.busy = True
@@ -632,7 +651,7 @@ cdef class Policy:
         cdef Estimate estimate = self.structure.report()
         cdef double values[MOST_LEVELS + 1]
         if self.settings.to_now and self.settings.delay > 0:
-            self.structure.enter()
+            self.enter()
             self.carry(values)
             memcpy(estimate.values, values, self.structure.order * sizeof(double))
             estimate.unknown_input = values[self.structure.order]
@@ -640,7 +659,7 @@ cdef class Policy:
 
     def reset(self):
         """Start afresh: the next sample is the first. Counters go on."""
-        self.structure.enter()
+        self.enter()
         self.refresh()
         self.course.past_count = 0
         self.course.valid = False
@@ -655,7 +674,7 @@ cdef class Policy:
     def change(self, **values):
         """Remember other values: those of `memory` by name."""
         cdef dict memory = self.memory | values
-        self.structure.enter()
+        self.enter()
         self.course, self.clock, self.sensor = memory, memory, memory
         for name, array in self.arrays.items():
             array[:] = memory[name]
