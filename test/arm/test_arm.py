@@ -82,7 +82,8 @@ def test_mimic_joints_and_grippers_are_left_out_and_joints_may_be_chosen():
     URDF.replace('"turn" type="revolute"', '"turn" type="continuous"'),
     URDF.replace('"turn" type="revolute"', '"turn" type="prismatic"'),
     re.sub('<limit .*?/>', '<limit velocity="0" effort="0"/>', URDF),  # which means none
-], ids=['continuous', 'prismatic', 'no limits'])  # fmt: skip
+    re.sub('"(shoulder|elbow)" type="revolute"', r'"\1" type="fixed"', URDF),
+], ids=['continuous', 'prismatic', 'no limits', 'one joint'])  # fmt: skip
 def test_other_joints_than_revolute_ones_with_limits(urdf):
     arm = Arm(urdf)
     t, q, _, torque = motion(arm.model, T[:1000])

@@ -179,12 +179,13 @@ class ArmModel:
         pin.computeJointJacobians(model, data, self._configuration(q))
         links = range(1, model.njoints)
         jacobians = np.array([pin.getJointJacobian(model, data, k, local) for k in links])
+        jacobians = jacobians.reshape(-1, 6, model.nv)  # of one joint Pinocchio has (6,)
         return np.asarray(jacobians.transpose(0, 2, 1) @ self._even @ jacobians)
 
     def gravity_columns(self, q: Floats) -> Floats:
         """Return the matrix (n, 3) whose product with a vector of gravity is g(q)."""
         center = pin.jacobianCenterOfMass(self._model, self._data, self._configuration(q))
-        return np.asarray(-np.sum(self.inertial[:, 0]) * center.T)
+        return np.asarray(-np.sum(self.inertial[:, 0]) * center.reshape(3, -1).T)
 
     def frame_jacobian(self, q: Floats, frame: str) -> Floats:
         """Return the Jacobian (6, n) at a frame's origin; raise ConfigurationError without it."""
@@ -193,12 +194,14 @@ class ArmModel:
             known = [f.name for f in model.frames if f.type == pin.FrameType.BODY]
             raise ConfigurationError(f'frame: expected one of {", ".join(known)}, got {frame!r}')
         at = model, self._data, self._configuration(q), model.getFrameId(frame)
-        return np.asarray(pin.computeFrameJacobian(*at, pin.ReferenceFrame.LOCAL))
+        jacobian = pin.computeFrameJacobian(*at, pin.ReferenceFrame.LOCAL)
+        return np.asarray(jacobian.reshape(6, -1))
 
     def regressor(self, q: Floats, velocity: Floats, acceleration: Floats) -> Floats:
         """Return the matrix (n, 10 n) whose product with `inertial`, as one row, is the torque."""
         at = self._model, self._data, self._configuration(q)
-        return np.array(pin.computeJointTorqueRegressor(*at, velocity, acceleration))
+        regressor = pin.computeJointTorqueRegressor(*at, velocity, acceleration)
+        return np.array(regressor.reshape(len(q), -1))
 
     def pseudo_inertias(self) -> Floats:
         """Return the pseudo-inertia for a unit of each of the ten parameters, (4, 4, 10)."""
