@@ -13,7 +13,10 @@ import math
 import os
 import pickle
 
-from fhaosmo_ros.core import ConfigurationError, OnlineEstimator
+from fhaosmo_ros.core import ConfigurationError, OnlineEstimator, Plant
+from fhaosmo_ros.core.arm.samples import Clock
+from fhaosmo_ros.core.model import phi
+from fhaosmo_ros.core.observer.kalman import LinearModel
 import numpy as np
 import pytest
 
@@ -116,9 +119,32 @@ def test_two_threads_on_one_estimator_get_an_error(kind):
     assert np.isfinite(estimator.observer.estimate.z).all()
 
 
+def test_a_thread_has_an_estimator_for_itself_until_it_has_smoothed():
+    estimator = running(KINDS['smoothed'], 100, 1)
+    calls = estimator.reset, estimator.finish, lambda: estimator.run(STAMPS, Y)
+    with estimator.policy, ThreadPoolExecutor(1) as other:
+        for call in calls:
+            with pytest.raises(RuntimeError, match='another thread'):
+                other.submit(call).result()
+    estimator.run(STAMPS, Y)
+
+
+def test_gains_that_are_not_scheduled_reject_no_sample():
+    estimator = running(KINDS['levant'], 300, 1)
+    assert estimator.update(STAMPS[0], 1.0).status.rejected
+    estimator.configure({'noise_size': 0.0})
+    assert not estimator.run(STAMPS[1:], Y[1:]).status.any()
+
+
 def test_compiled_code_takes_no_arrays_of_other_sizes():
     """It reads arrays without looking at their ends: who calls it from Python is refused."""
-    policy, none = running({}, 50, 5).policy, np.zeros((len(Y), 0))
-    for arrays in ((STAMPS[:2], Y, none), (STAMPS, Y, none[:2]), (STAMPS, Y, np.zeros((200, 2)))):
+    policy, none, three = running({}, 50, 5).policy, np.zeros((len(Y), 0)), np.ones(3)
+    smoother = running(KINDS['smoothed'], 300, 5).smoothing
+    for call, *arguments in (
+        (policy.run, STAMPS[:2], Y, none), (policy.run, STAMPS, Y, np.zeros((200, 2))),
+        (Plant()._system.advance, Y, Y), (Clock().interval, 1e-3, three, three[:2], three),
+        (smoother._passes.forward, smoother._rows, -1), (LinearModel, np.eye(18), 1.0),
+        *((phi.Expressions, [[(int(code), 1)]], 1, 1) for code in (phi.ADD, phi.STATE)),
+    ):  # fmt: skip
         with pytest.raises(ValueError, match=r'expected|arrays'):
-            policy.run(*arrays)
+            call(*arguments)
