@@ -254,7 +254,8 @@ class OnlineEstimator:
         if version != VERSION:
             raise ConfigurationError(f'snapshot: expected version {VERSION}, got {version}')
         own, events = self.policy.memory, vars(self.events.memory)
-        if np.size(values.get('past_pieces', ())) != own['past_pieces'].size:
+        pieces = values.get('past_pieces', np.zeros(0))
+        if isinstance(pieces, np.ndarray) and pieces.size != own['past_pieces'].size:
             raise ConfigurationError(
                 'snapshot: expected that of an estimator with the same measurement_delay'
             )

@@ -437,8 +437,10 @@ cdef class SelfTuning(Structure):
             shared['samples'] = 0  # members are lost, as the next step would find
         if shared['samples'] <= FIRST_SAMPLES:
             found = {name: found[name] for name in EARLY}
-        found |= shared | {'model': list(model.values())}
-        found = {name: np.clip(np.nan_to_num(x), -LARGEST, LARGEST) for name, x in found.items()}
+        found |= shared
+        for name, numbers in found.items():
+            found[name] = np.clip(np.nan_to_num(numbers), *RANGES.get(name, (0.0, LARGEST)))
+        found['model'] = np.clip(np.nan_to_num([*model.values()]), -LARGEST, LARGEST)
         found['variances'] = np.array([self.variances[i] for i in range(self.levels)])
         return whole | found
 
