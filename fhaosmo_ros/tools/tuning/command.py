@@ -18,11 +18,10 @@ from fhaosmo_ros.tools.bags.reader import BagReader
 from fhaosmo_ros.tools.cli.command import Output, run_command
 from fhaosmo_ros.tools.cli.options import add_value_options, assigned
 from fhaosmo_ros.tools.tuning import report
-from fhaosmo_ros.tools.tuning.identify import identify_input, make_gains, run
+from fhaosmo_ros.tools.tuning.identify import identify_input, make_gains
 from fhaosmo_ros.tools.tuning.linear_gains import chosen_otherwise
 from fhaosmo_ros.tools.tuning.objective import TUNE_PARAMETERS
 from fhaosmo_ros.tools.tuning.tuner import simulated, Tuner
-import numpy as np
 
 TRIALS = 1000
 BOTH = ParameterTable(
@@ -76,7 +75,7 @@ def _tune(arguments: argparse.Namespace, stop: Stop) -> None:
     with Output(arguments.output, arguments.force) as output:
         if arguments.bag:
             with stop.raising():
-                found = _of_bag(arguments.bag, estimator, tuning)
+                parameters, text = _of_bag(arguments.bag, estimator, tuning)
         else:
             values = TUNE_PARAMETERS.complete(tuning)
             with stop.raising():
@@ -85,16 +84,18 @@ def _tune(arguments: argparse.Namespace, stop: Stop) -> None:
                 tuner = Tuner(training, held_out, estimator, values, arguments.seed)
             jobs = arguments.jobs or os.cpu_count() or 1
             result = tuner.search(arguments.trials, jobs, arguments.storage, stop.is_set)
-            found = report.of_search(tuner, result)
-        report.save(output.path, arguments.command_line, found)
+            parameters, text = report.of_search(tuner, result)
+        report.save(output.path, arguments.command_line, parameters, text)
         folder = output.keep()
-    print(f'\n{found.main}\n')
+    print(f'\n{text}\n')
     print(f'output: {folder}/gains.yaml, report.md')
     print(f'use it: ros2 run fhaosmo_ros estimator --ros-args --params-file {folder}/gains.yaml')
 
 
-def _of_bag(path: Path, estimator: dict[str, Any], tuning: dict[str, Any]) -> report.Report:
-    """Find the gains for what the y of a bag shows."""
+def _of_bag(
+    path: Path, estimator: dict[str, Any], tuning: dict[str, Any]
+) -> tuple[dict[str, Any], str]:
+    """Return the gains for what the y of a bag shows, and a report of them."""
     if others := chosen_otherwise(estimator):
         raise ConfigurationError(
             f'--bag: expected gains of structure levant, got {", ".join(others)} set. Leave that '
@@ -110,13 +111,11 @@ def _of_bag(path: Path, estimator: dict[str, Any], tuning: dict[str, Any]) -> re
         samples, field = inputs.samples()
         if field.wraps:
             samples = samples.unwrapped()
-        u = np.zeros((len(samples.values), len(model.inputs)))
-        if model.used_inputs:
-            u = inputs.at(samples)
+        u = inputs.at(samples)
     t = (samples.stamps - samples.stamps[0]) * 1e-9
     found = identify_input((t, samples.values, u), model, values, given)
     made = make_gains(found, given)
-    return report.of_bag(found, made, run(found, made), path.resolve().name)
+    return report.of_bag(found, made, path.resolve().name)
 
 
 def read_parameters(files: list[Path], rules: list[str]) -> tuple[dict[str, Any], dict[str, Any]]:

@@ -7,17 +7,14 @@ from typing import Any, NamedTuple
 
 from fhaosmo_ros.core.model.triangular import TriangularModel
 from fhaosmo_ros.core.observer.configuration import usual_step
-from fhaosmo_ros.core.online.counters import Counters
-from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.online.policy import GAP_SAMPLES
 from fhaosmo_ros.core.parameters.declaration import Parameters
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
-from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS, OBSERVER_PARAMETERS
+from fhaosmo_ros.core.parameters.tables import OBSERVER_PARAMETERS
 from fhaosmo_ros.core.simulation.metrics import rms
 from fhaosmo_ros.tools.cli.command import progress
 from fhaosmo_ros.tools.tuning.likelihood import CLIP, Design, Evaluation, Likelihood, Samples
 from fhaosmo_ros.tools.tuning.linear_gains import GAMMA, kalman_gains, rounded, SCHEME, WIDTH
-from fhaosmo_ros.tools.tuning.objective import stamps_of
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_opening
@@ -53,8 +50,6 @@ FEWEST_STEPS = 20
 """Changes of y that say a quantum."""
 ON_GRID = 0.02
 """Values count as quantised if they are this close to multiples of the quantum, relatively."""
-SIZE_OF_USUAL = 0.9616
-"""RMS of a standard normal number among the 99 % that are nearest to 0."""
 UNSEEN = 0.97
 """Expected error of d over its size from which on an estimate tells nothing."""
 NO_NOISE = 1e-7
@@ -82,18 +77,6 @@ class Gains(NamedTuple):
 
     parameters: dict[str, Any]
     expected: Floats  # (n + 1,) standard deviations of the errors of z and d
-    innovation: float  # standard deviation of the innovations
-    share: float  # part of an innovation that is left after the correction, 1 - K_1
-
-
-class Run(NamedTuple):
-    """The estimator with these gains along the bag."""
-
-    unknown_input: Floats  # (K,)
-    size: float  # RMS innovation over the expected one, without the largest hundredth
-    correlation: float  # the largest autocorrelation of the innovations, within `LAGS` samples
-    probability: float  # of so large ones, were innovations white (Ljung and Box 1978)
-    counters: Counters
 
 
 def identify_input(
@@ -208,29 +191,24 @@ def make_gains(found: Identified, given: Mapping[str, Any]) -> Gains:
             f'follows that), or is the order ({order}) too high by one? Else a '
             'sensor with less noise, or a higher rate, is needed'
         )
-    return Gains(values, errors[: order + 1], math.sqrt(variance), 1.0 - float(k[0]))
+    return Gains(values, errors[: order + 1])
 
 
-def run(found: Identified, gains: Gains) -> Run:
-    """Let the estimator run over the bag, as the node would, and judge its innovations."""
-    samples = found.likelihood.samples
-    t, begin = np.cumsum(samples.h), int(BEGIN * len(samples.y))
-    estimator = OnlineEstimator(ESTIMATOR_PARAMETERS.complete(gains.parameters))
-    u = samples.u if estimator.observer.used_inputs else None
-    trajectory = estimator.run(stamps_of(t), samples.y, u)
-    r = trajectory.innovation[:, 0] / (gains.share * gains.innovation)
-    r = r[np.isfinite(r) & samples.used & (np.arange(len(r)) >= begin)]
-    usual = r[np.abs(r) <= np.quantile(np.abs(r), 0.99)]
-    size = rms(usual) / SIZE_OF_USUAL
-    # Whether they are white (Ljung and Box 1978).
-    r = np.clip(r, -CLIP, CLIP)
+def whiteness(found: Identified) -> tuple[float, float]:
+    """
+    Return the largest autocorrelation of the innovations within `LAGS` samples, and a probability.
+
+    It is that of such correlations, were innovations white (Ljung and Box 1978).
+    """
+    begin = int(BEGIN * len(found.best.innovations))
+    r = found.best.innovations[begin:]
+    r = np.clip(r[np.isfinite(r) & found.likelihood.samples.used[begin:]], -CLIP, CLIP)
     r = r - r.mean()
     count, lags = len(r), np.arange(1, LAGS + 1)
     correlations = np.array([r[:-j] @ r[j:] for j in lags]) / (r @ r)
     statistic = count * (count + 2.0) * np.sum(correlations**2 / (count - lags))
-    largest, probability = correlations[np.abs(correlations).argmax()], chi2.sf(statistic, LAGS)
-    d = trajectory.unknown_input
-    return Run(d, size, float(largest), float(probability), estimator.counters)
+    largest = correlations[np.abs(correlations).argmax()]
+    return float(largest), float(chi2.sf(statistic, LAGS))
 
 
 def _prepared(
