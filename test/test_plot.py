@@ -3,8 +3,9 @@
 
 import bag_files as files
 from fhaosmo_ros.core import OnlineEstimator
+from fhaosmo_ros.tools.bags.topics import series
 from fhaosmo_ros.tools.bags.types import labelled_array
-from fhaosmo_ros.tools.demo import OTHERS, others, read_run, START, table
+from fhaosmo_ros.tools.demo import observers, OTHERS, report, START
 from fhaosmo_ros.tools.plot import command as plot
 from fhaosmo_ros.tools.plot.curves import read_curves
 from fhaosmo_ros.tools.plot.figures import COLUMNS, envelope
@@ -60,31 +61,32 @@ def test_truth_is_unknown_where_the_bag_lacks_it(bag, tmp_path, capsys):
 
 
 def test_table_says_the_errors_that_are_in_the_bag(bag):
-    run = read_run(bag)
-    assert run.curves.names == NAMES
-    np.testing.assert_allclose(run.t, T[KNOWN] - T[KNOWN][0], rtol=0.0, atol=1e-12)
-    text = table(run, {}, [])
-    assert 'samples: 401, 100.0 a second' in text
-    (line,) = [line for line in text.splitlines() if line.startswith('this estimator, live')]
-    (states,) = [line for line in text.splitlines() if line.startswith('RMS errors of the states')]
-    of_states = [float(part.split()[1]) for part in states.split(': ')[1].split(', ')]
-    late = np.array(KNOWN)[run.t >= START]
-    rms = np.sqrt(np.mean((ESTIMATE - TRUTH)[late] ** 2, axis=0))
-    moved = [np.abs(np.diff(d[late, 3])).sum() for d in (ESTIMATE, TRUTH)]
-    expected = [rms[3], moved[0] / moved[1], *rms[:3]]
-    assert [*map(float, line.split()[-2:]), *of_states] == pytest.approx(expected, rel=0.05)
+    (live,) = observers(bag, {'gains': 'self_tuning'})
+    assert live.names == NAMES
+    t = (live.stamps - live.stamps[0]) * 1e-9
+    np.testing.assert_allclose(t, T[KNOWN] - T[KNOWN][0], rtol=0.0, atol=1e-12)
+    head, *rows = report([live], []).splitlines()
+    assert head.startswith('from 2 s')
+    late = np.array(KNOWN)[t >= START]
+    for k, row in enumerate(rows):
+        error = np.sqrt(np.mean((ESTIMATE - TRUTH)[late, k] ** 2))
+        moved = [np.abs(np.diff(x[late, k])).sum() for x in (ESTIMATE, TRUTH)]
+        assert [float(x) for x in row.split()[-2:]] == pytest.approx(
+            [error, moved[0] / moved[1]], rel=0.01
+        )
+    assert [row.split()[3] for row in rows] == NAMES
 
 
 def test_other_observers_go_through_the_same_samples(bag):
-    """What changes begins a column of the table."""
-    run = read_run(bag)
-    compared = others(run, {'gains': 'fixed'})
-    name, changes = [*OTHERS.items()][1]
-    alone = OnlineEstimator(changes).run(run.y.stamps, run.y.values.ravel())
-    np.testing.assert_array_equal(compared[name], alone.unknown_input[KNOWN])
-    text = table(run, compared, [(files.ORIGIN + 3 * 10**9, 'noise')])
+    """What changes begins a table."""
+    live, *others = observers(bag, {'gains': 'fixed'})
+    assert [c.label for c in others] == [*OTHERS]
+    y = series(bag, '/y')
+    alone = OnlineEstimator([*OTHERS.values()][1]).run(y.stamps, y.values)
+    np.testing.assert_array_equal(others[1].estimate[:, 0], alone.unknown_input[KNOWN])
+    text = report([live, *others], [(files.ORIGIN + 3 * 10**9, 'noise')])
+    assert text.count('fuzzy, the power held') == 2
     assert 'from 2 s' in text
-    assert others(run, {'gains': 'self_tuning'}) == {}
 
 
 def test_thinned_curve_keeps_its_ends_its_extremes_and_its_gaps():

@@ -7,27 +7,24 @@ from itertools import pairwise
 import os
 from pathlib import Path
 import time
-from typing import Any, NamedTuple
+from typing import Any
 
 from fhaosmo_ros.core.observer.observer import Observer
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.files import load
-from fhaosmo_ros.core.simulation.metrics import chatter, rms
 from fhaosmo_ros.stop_signals import Stop, Stopped
-from fhaosmo_ros.tools.bags.topics import Series, series
+from fhaosmo_ros.tools.bags.topics import series
 from fhaosmo_ros.tools.bags.writer import BagWriter
 from fhaosmo_ros.tools.cli.command import Output, progress, run_command, shipped
 from fhaosmo_ros.tools.cli.processes import start_node
-from fhaosmo_ros.tools.plot.curves import Curves, read_curves
+from fhaosmo_ros.tools.plot.curves import Curves, metrics, read_curves
 from fhaosmo_ros.tools.plot.figures import save_curves
 from fhaosmo_ros.topics import TRUTH
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
 START = 2.0
-"""Seconds of the start that the table leaves out."""
+"""Seconds of the start that the tables leave out."""
 OTHERS: dict[str, dict[str, Any]] = {
     'sign, gains of the paper': {
         'variant': 'sign', 'scheme': 'explicit', 'lambda': [15.0], 'alpha': [30.0],
@@ -37,12 +34,11 @@ OTHERS: dict[str, dict[str, Any]] = {
     'self-tuning': {'gains': 'self_tuning'},
 }  # fmt: skip
 """Observers that go through the same y: how their parameters differ from those of the file."""
-WORDS = """
-Error: RMS of the estimate of d minus d. Chatter: how much further the estimate moves than d does
-(1: no chatter). The first observer ran live; the others went through the same y afterwards, by
-the same code. Self-tuning is not the paper's observer: it is a bank of Kalman filters that is told
-the model alone.
-"""
+WORDS = """\
+RMS error: of the estimate minus the truth. Chatter: how much further the estimate moves than the
+truth does (1: no chatter). The first observer ran live; the others went through the same y
+afterwards, by the same code. Self-tuning is not the paper's observer: it is a bank of Kalman
+filters that is told the model alone."""
 START_DEADLINE = 60.0
 """Seconds for a node to appear; it takes one or two where nothing else runs."""
 NOISE = 'now with noise of 1e-4 on y', {'noise_std': 1e-4}
@@ -101,13 +97,9 @@ def _demo(arguments: argparse.Namespace, stop: Stop) -> None:
         marks = _record(folder, parameters, arguments.duration, noisy, stop)
         if stop.is_set():
             print('stopped early: reporting what has been recorded')
-        run = read_run(folder / 'bag')
-        compared = others(run, estimator)
-        errors = {name: estimate - run.curves.truth[:, -1] for name, estimate in compared.items()}
-        if errors:
-            errors['live'] = run.errors[:, -1]
-        save_curves([run.curves], folder / 'demo.png', errors, marks)
-        text = table(run, compared, marks)
+        curves = observers(folder / 'bag', estimator)
+        save_curves(curves[:1], folder / 'demo.png', curves[1:], marks)
+        text = report(curves, marks)
         (folder / 'report.txt').write_text(text + '\n', encoding='utf-8')
         print(f'\n{text}\n')
         final = output.keep()
@@ -170,30 +162,12 @@ def _record(
         return marks
 
 
-class Run(NamedTuple):
-    """A recorded run: estimates beside the truth at the sample that each was computed from."""
-
-    curves: Curves  # of K estimates whose truth is known
-    y: Series  # all samples
-    rows: NDArray[np.int64]  # (K,) the sample behind each estimate
-
-    @property
-    def t(self) -> Floats:
-        """Seconds since the first estimate."""
-        return np.asarray((self.curves.stamps - self.curves.stamps[0]) * 1e-9)
-
-    @property
-    def errors(self) -> Floats:
-        """Errors of states and d, (K, n + 1)."""
-        return self.curves.estimate - self.curves.truth
-
-
-def read_run(bag: Path) -> Run:
+def observers(bag: Path, parameters: Mapping[str, Any]) -> list[Curves]:
     """
-    Read the bag of a demonstration.
+    Return the estimates of a run beside the truth, and d as `OTHERS` estimate it from the same y.
 
-    Each estimate is compared with the truth of the sample behind it (``~/stamp``), not with that
-    of the moment at which it was published.
+    An estimate is compared with the truth of the sample behind it (``~/stamp``), not with that of
+    the moment at which it was published. There are no others if gains tune themselves.
 
     Raises
     ------
@@ -201,57 +175,33 @@ def read_run(bag: Path) -> Run:
         The bag holds no estimate with its truth.
 
     """
-    (curves,) = read_curves(bag, ['/estimator'], '/plant')
-    if curves.truth is None or not (known := np.isfinite(curves.truth).all(axis=1)).any():
+    (live,) = read_curves(bag, ['/estimator'], '/plant')
+    if live.truth is None or not (known := np.isfinite(live.truth).all(axis=1)).any():
         raise ConfigurationError('the run ended before an estimate arrived beside its truth')
-    curves = curves.part(known)._replace(label='estimated live')
-    y = series(bag, '/y')
-    rows = np.searchsorted(y.stamps, curves.stamps).clip(max=len(y.stamps) - 1)
-    return Run(curves, y, rows)
-
-
-def others(run: Run, parameters: Mapping[str, Any]) -> dict[str, Floats]:
-    """Return d as `OTHERS` estimate it from the same samples; nothing if gains tune themselves."""
+    live = live.part(known)._replace(label='this estimator, live')
     if parameters.get('gains') == 'self_tuning':
-        return {}
-    return {
-        name: OnlineEstimator({**parameters, **changes})
-        .run(run.y.stamps, run.y.values.ravel())
-        .unknown_input[run.rows]
+        return [live]
+    y, of_d = series(bag, '/y'), live._replace(names=['d'], truth=live.truth[:, -1:])
+    rows = np.searchsorted(y.stamps, live.stamps).clip(max=len(y.stamps) - 1)
+    runs = {
+        name: OnlineEstimator({**parameters, **changes}).run(y.stamps, y.values)
         for name, changes in OTHERS.items()
     }
+    return [live] + [
+        of_d._replace(label=name, estimate=run.unknown_input[rows, np.newaxis])
+        for name, run in runs.items()
+    ]
 
 
-def table(run: Run, compared: Mapping[str, Floats], marks: Sequence[tuple[int, str]]) -> str:
-    """
-    Return a report: how each observer estimates d, then states and samples.
-
-    `marks` says when something changed (stamps in ns), and what.
-    """
-    t, d = run.t, run.curves.truth[:, -1]
-    edges = [START, *((stamp - run.curves.stamps[0]) * 1e-9 for stamp, _ in marks), np.inf]
+def report(curves: list[Curves], marks: Sequence[tuple[int, str]]) -> str:
+    """Return a table for the time after the start, and one from each of `marks` (ns) on."""
+    origin = curves[0].stamps[0]
+    t = (curves[0].stamps - origin) * 1e-9
+    edges = [START, *((stamp - origin) * 1e-9 for stamp, _ in marks), np.inf]
     parts = {begin: (t >= begin) & (t < end) for begin, end in pairwise(edges)}
     parts = {begin: part for begin, part in parts.items() if part.any()} or {0.0: t >= 0.0}
-    estimates = {'this estimator, live': run.curves.estimate[:, -1], **compared}
-    width = max(map(len, estimates))
-    lines = [
-        f'{"d":{width}}' + ''.join(f'{f"from {begin:.0f} s":>20}' for begin in parts),
-        f'{"":{width}}' + f'{"error":>12}{"chatter":>8}' * len(parts),
+    tables = [
+        metrics([c.part(part) for c in curves], f'from {begin:.0f} s')
+        for begin, part in parts.items()
     ]
-    for name, estimate in estimates.items():
-        lines.append(f'{name:{width}}' + ''.join(
-            f' {rms((estimate - d)[part]):11.2g} {chatter(estimate[part], d[part]):7.3g}'
-            for part in parts.values()
-        ))  # fmt: skip
-    sizes = ''.join(f'{rms(d[part]):12.2g}{"":8}' for part in parts.values())
-    lines.append(f'{"RMS of d itself":{width}}{sizes}'.rstrip())
-    if compared:
-        lines.append(WORDS.rstrip())
-    begin = min(parts)
-    late = run.errors[t >= begin]
-    errors = [f'{name} {rms(late[:, k]):.2g}' for k, name in enumerate(run.curves.names[:-1])]
-    rate = 1e9 / np.mean(np.diff(run.y.stamps))
-    return '\n'.join([
-        *lines, '', f'RMS errors of the states from {begin:.0f} s on: {", ".join(errors)}',
-        f'samples: {len(run.y.stamps)}, {rate:.1f} a second',
-    ])  # fmt: skip
+    return '\n\n'.join([*tables, WORDS] if curves[1:] else tables)

@@ -41,7 +41,7 @@ class Curves(NamedTuple):
         unit = derivative_unit(self.unit, self.names.index(name))
         return titled('unknown\ninput d' if name == 'd' else name, unit)
 
-    def part(self, rows: NDArray[np.bool_]) -> 'Curves':
+    def part(self, rows: slice | NDArray[np.bool_]) -> 'Curves':
         """Return some of the rows."""
         arrays = {k: x for k, x in self._asdict().items() if isinstance(x, np.ndarray)}
         return self._replace(**{name: array[rows] for name, array in arrays.items()})
@@ -143,19 +143,16 @@ def _events(reader: BagReader, topic: str, end: int) -> list[tuple[int, int]]:
     return list(spans.items())
 
 
-def metrics(curves: list[Curves]) -> str:
-    """Return a table: a row for each state and d of each estimator, over the second half."""
+def metrics(curves: list[Curves], title: str) -> str:
+    """Return a table: a row for each state and d of each estimator."""
     width = max(len(c.label) for c in curves)
-    lines = [f'{"2nd half":{width}}  {"":4}{"RMS":>12}{"RMS error":>12}{"chatter":>10}']
+    lines = [f'{title:{width}}  {"":4}{"RMS":>12}{"RMS error":>12}{"chatter":>10}']
     for c in curves:
-        half = slice(len(c.stamps) // 2, None)
         for k, name in enumerate(c.names):
-            estimate = c.estimate[half, k]
-            line = f'{c.label:{width}}  {name:4}{rms(estimate):12.3g}'
+            line = f'{c.label:{width}}  {name:4}{rms(c.estimate[:, k]):12.3g}'
             if c.truth is not None:
-                truth = c.truth[half, k]
-                known = np.isfinite(truth)
-                estimate, truth = estimate[known], truth[known]
+                known = np.isfinite(c.truth[:, k])
+                estimate, truth = c.estimate[known, k], c.truth[known, k]
                 line += f'{rms(estimate - truth):12.3g}{chatter(estimate, truth):10.3g}'
             lines.append(line)
     return '\n'.join(lines)

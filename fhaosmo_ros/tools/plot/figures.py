@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Figures of runs and of estimates in bags."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -48,29 +48,29 @@ def _columns(t: NDArray[Any]) -> NDArray[np.intp]:
 def save_curves(
     curves: list[Curves],
     path: Path,
-    errors: Mapping[str, NDArray[np.float64]] | None = None,
+    compared: Sequence[Curves] = (),
     marks: Sequence[tuple[int, str]] = (),
 ) -> None:
     """
     Write a figure of several estimates laid one over another.
 
-    From top to bottom: a row for each state, for d, for errors of d if there are some, for gamma
-    if an estimate has it, and for the innovations of the first estimate.
+    From top to bottom: a row for each state, for d, for errors of d if others are compared, for
+    gamma if an estimate has it, and for the innovations of the first estimate.
 
     Parameters
     ----------
     curves : list of Curves
     path : path
         Its suffix names the format.
-    errors : mapping of str to (K,) array, optional
-        Of d, at the stamps of the first estimate, by what makes them.
+    compared : sequence of Curves
+        Others, whose errors of d are drawn beside that of the first one.
     marks : sequence of (int, str)
         Times in nanoseconds at which something changed, and what.
 
     """
     first, names = curves[0], max((c.names for c in curves), key=len)
     gamma = ['gamma'] if any(c.gamma is not None for c in curves) else []
-    rows = [*names, *(['error of d'] if errors else []), *gamma, 'innovation']
+    rows = [*names, *(['error of d'] if compared else []), *gamma, 'innovation']
     figure = Figure(figsize=(8.5, 1.45 * len(rows) + 0.9), layout='constrained')
     axes = dict(zip(rows, figure.subplots(len(rows), 1, sharex=True), strict=True))
     origin = min(c.stamps[0] for c in curves)
@@ -103,15 +103,16 @@ def save_curves(
     t = (first.stamps - origin) * 1e-9
     _draw_innovations(axes['innovation'], t, first.innovation, first.epsilon)
     axes['innovation'].set_ylabel('|innovation|' + ('\n(first)' if len(curves) > 1 else ''))
-    if errors:
+    if compared:
         row = axes['error of d']
-        for (name, error), colour in zip(errors.items(), OTHERS, strict=False):
-            row.plot(*envelope(t, error), linewidth=0.8, label=name, color=colour)
+        for c, colour in zip([*compared, first], OTHERS, strict=False):
+            error = c.estimate[:, -1] - c.truth[:, -1]
+            row.plot(*envelope(t, error), linewidth=0.8, label=c.label, color=colour)
         row.lines[-1].set(color=COLOURS[0], linestyle='--', linewidth=1.2)  # the run itself
         size = 1.5 * float(np.nanmax(np.abs(first.estimate[:, -1])))
         row.set_ylim(-size, size)  # what is beyond leaves the picture
         row.set_ylabel('error of d')
-        row.legend(loc='upper right', ncols=len(errors), fontsize='x-small')
+        row.legend(loc='upper right', ncols=len(row.lines), fontsize='x-small')
     for row in axes.values():
         row.grid(alpha=0.3)
         for stamp, _ in marks:
