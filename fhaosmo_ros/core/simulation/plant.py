@@ -60,14 +60,6 @@ class Plant:
         self._system = System(self._model.expressions, self._d, p['integration_step'], z)
         self._random = np.random.default_rng(p['noise_seed'])
 
-    def __repr__(self) -> str:
-        p = self._parameters
-        return (
-            f'Plant(order={self.order}, phi={list(self._model.phi)}, '
-            f'd: {p["disturbance"]} of {p["disturbance_amplitude"]:g}, '
-            f'noise_std={p["noise_std"]:g})'
-        )
-
     @property
     def parameters(self) -> dict[str, Any]:
         """All parameters with their present values; a copy."""
