@@ -70,8 +70,7 @@ def test_parameters_of_a_named_node_by_file_and_command_line(bag, tmp_path, caps
         'rig: {left: {ros__parameters: {epsilon: 3.0, lambda: 15, publish_rate: 50.0}}}\n'
         'estimator: {ros__parameters: {}}'
     )
-    rules = ['plant:order:=7', 'rig/left:variant:=sign', '/rig/left:alpha:=30', 'gamma_rate:=0.1',
-             'lambda:=[20, 15.5, 15, 1e1]']  # fmt: skip
+    rules = ['variant:=sign', 'alpha:=30', 'gamma_rate:=0.1', 'lambda:=[20, 15.5, 15, 1e1]']
     arguments = ['--params-file', tmp_path / 'p.yaml', '--node', '/rig/left']
     arguments += [word for rule in rules for word in ('-p', rule)]
     assert run(bag, '-o', tmp_path / 'o.npz', *arguments) == 0
@@ -163,7 +162,7 @@ def test_types_of_a_sourced_workspace_go_into_the_bag(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize('lag', [None, 0.2])
-def test_smoothed_estimates_are_the_librarys(lag, tmp_path, capsys):
+def test_smoothed_estimates_are_the_librarys(lag, tmp_path):
     y = Y.copy()
     y[500:503] = np.nan
     bag = files.write(tmp_path / 'bag', files.floats(STAMPS, y))
@@ -181,7 +180,6 @@ def test_smoothed_estimates_are_the_librarys(lag, tmp_path, capsys):
             np.testing.assert_array_equal(found[column], stamps)
         np.testing.assert_allclose(found['unknown_input'], d, rtol=0.0, atol=1e-7)
         np.testing.assert_array_equal(found['y'], y[np.isin(STAMPS, stamps)])
-    assert 'smoothed: each estimate by the samples before' in capsys.readouterr().out
 
 
 T = np.arange(300) * 1e-3

@@ -17,9 +17,9 @@ TABLE = "replay -p order:=2 -p phi:=['0','torque'] -p inputs:=[torque] "
 WRONG = {
     # Bags.
     'replay /no/bag': ['/no/bag', 'does not exist'],
-    'replay old.bag': ['ROS 1', 'rosbags-convert --src old.bag'],
+    'replay old.bag': ['ROS 1', '`rosbags-convert`', 'got another file'],
     'replay spoilt': ['whole bag', 'mcap recover'],
-    'replay nameless': ['metadata.yaml', 'nameless.mcap: name that file'],
+    'replay nameless': ['metadata.yaml', '`ros2 bag reindex`'],
     'replay empty': ["expected messages on topic '/y', got none"],
     'replay joints -p input_field:=position[3]': ['position[3]', '3 in one message'],
     'replay sqlite -p input_stamp:=source': ['input_stamp source: expected an mcap bag'],
@@ -66,7 +66,7 @@ WRONG = {
     f'{TUNE} -psettled:=4.0': ['more than 4 s'],
     f'{TUNE} --trials=0': ['--trials >= 1'],
     f'{TUNE} --storage nodb://x': ['storage'],
-    f'{TUNE} -o /proc/no/out': ['output'],
+    f'{TUNE} -o /proc/no/out': ['No such file or directory: /proc/no'],
     f'{TUNE} -o bag': ['expected a new name (or --force'],
     'tune --bag bag -o out -p structure:=cascade': ['got structure set'],
 }

@@ -122,13 +122,8 @@ def _of_node(text: str, node: str, strict: bool) -> dict[str, Any]:
         )
     ours = [section for section in sections if _matches(section, node)]
     names = [section.lstrip('/') for section in sections]
-    if strict and not ours:
+    if not ours and (strict or any(_misspells(name, node) for name in names)):
         raise ConfigurationError(f"expected a section '{node}' or '/**', got {', '.join(names)}")
-    misspelt = [name for name in names if _misspells(name, node)]
-    if misspelt and not ours:
-        raise ConfigurationError(
-            f"no section is that of node '{node}', got '{misspelt[0]}'; did you mean '{node}'?"
-        )
     return {name: value for section in ours for name, value in sections[section].items()}
 
 
@@ -149,9 +144,7 @@ def select(values: Mapping[str, Any], table: ParameterTable) -> dict[str, Any]:
     tables = [table, *(with_channels(other, own) for other in NODE_TABLES.values())]
     for name in values:
         if not any(name in other for other in tables) and not is_built_in(name):
-            families = (p.name for p in table.families)
-            everybody = dict.fromkeys([*(n for other in tables for n in other), *families])
-            raise unknown_parameter(name, everybody)
+            raise unknown_parameter(name, dict.fromkeys(n for other in tables for n in other))
     return {
         name: names if name == CHANNELS else table[name].coerce(value)
         for name, value in values.items()

@@ -98,23 +98,19 @@ def parse(text: str) -> Any:
 
 def _check(text: str) -> None:
     """Refuse what is too large, or not read by ROS, before anything is made of it."""
-    values = depth = documents = 0
+    values = depth = 0
     for event in yaml.parse(text, Loader=PARSER):
-        documents += isinstance(event, yaml.DocumentStartEvent)
         values += isinstance(event, yaml.NodeEvent)
         depth += isinstance(event, yaml.CollectionStartEvent)
         depth -= isinstance(event, yaml.CollectionEndEvent)
-        if documents > 1:
-            raise _refused(event, 'a second document')
         if values > MAX_VALUES:
             raise _refused(event, f'more than {MAX_VALUES} values')
         if depth > MAX_DEPTH:
             raise _refused(event, f'lists or mappings nested deeper than {MAX_DEPTH}')
         if isinstance(event, yaml.AliasEvent):
             raise _refused(event, f'the alias *{event.anchor}, which ROS does not read either')
-        tag = getattr(event, 'tag', None)
-        if tag not in TAGS:
-            raise _refused(event, f'the tag {tag!r}')
+        if getattr(event, 'tag', None) not in TAGS:
+            raise _refused(event, f'the tag {event.tag!r}')
 
 
 def _refused(place: Any, problem: str) -> ConfigurationError:

@@ -117,6 +117,11 @@ class BagReader:
         """Return how many messages a topic has."""
         return sum(c.msgcount for c in self.connections if c.topic == topic)
 
+    def names_above(self, part: str) -> list[str]:
+        """Return whose topics of this last part have messages: '/e' of '/e/state'."""
+        found = {c.topic for c in self.connections if c.msgcount and c.topic.endswith(f'/{part}')}
+        return sorted(topic.removesuffix(f'/{part}') for topic in found)
+
     def message_type(self, topic: str) -> str:
         """
         Return a topic's message type.
@@ -297,28 +302,19 @@ def _expect(topic: str, listed: int, there: int) -> None:
 
 def _expect_bag(path: Path) -> None:
     """Raise if a path is no bag, or one that is being written, or was when its writer died."""
-    files = [path] if path.is_file() else sorted(path.iterdir()) if path.is_dir() else []
-    files = [p for p in files if p.suffix in ('.mcap', '.db3')]
-    if path.is_dir() and not (path / 'metadata.yaml').exists():
-        found = 'a folder without it'
-        if files:
-            found += f' but {files[0].name}: name that file, or run ros2 bag reindex'
-    elif path.suffix == '.bag':
-        found = f'one of ROS 1: rosbags-convert --src {path} --dst NEW makes one of ROS 2'
-    elif not files and not path.is_dir():
-        found = 'a file that is none' if path.exists() else 'a path that does not exist'
-    else:
-        for file in files:
-            if any(Path(f'{file}{end}').exists() for end in ('-journal', '-wal')):
-                raise ValueError(
-                    f'a file whose writer was killed: `sqlite3 {file} .tables` takes back what is '
-                    'half'
-                )
-        return
-    raise ConfigurationError(
-        f'bag {path}: expected a bag (a folder with metadata.yaml, or its .mcap or .db3), '
-        f'got {found}'
-    )
+    is_bag = (path / 'metadata.yaml').exists() or path.suffix in ('.mcap', '.db3')
+    if not (path.exists() and is_bag):
+        found = 'a folder without it' if path.is_dir() else 'another file'
+        raise ConfigurationError(
+            f'bag {path}: expected a folder with metadata.yaml (`ros2 bag reindex` makes it), or '
+            'an .mcap or .db3 file (`rosbags-convert` makes one of a bag of ROS 1), got '
+            f'{found if path.exists() else "a path that does not exist"}'
+        )
+    for file in [path, *path.glob('*.db3')]:
+        if any(Path(f'{file}{end}').exists() for end in ('-journal', '-wal')):
+            raise ValueError(
+                f'a file whose writer was killed: `sqlite3 {file} .tables` takes back what is half'
+            )
 
 
 @contextmanager

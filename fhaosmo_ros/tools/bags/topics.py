@@ -138,18 +138,14 @@ def recorded_parameters(reader: BagReader, name: str | None = None) -> Recorded 
         They are not parameters of this version.
 
     """
-    topics = {
-        c.topic
-        for c in reader.connections
-        if c.topic.endswith(f'/{PARAMETERS}') and c.msgtype == TEXT and c.msgcount
-    }
+    nodes = reader.names_above(PARAMETERS)
     if name is None:
-        if len(topics) != 1:
+        if len(nodes) != 1:
             return None
-        name = min(topics).removesuffix(f'/{PARAMETERS}')
+        name = nodes[0]
     for node in (name, name.rpartition('/')[0]):
         topic = f'{node}/{PARAMETERS}'
-        if topic in topics:
+        if node in nodes and reader.message_type(topic) == TEXT:
             _, _, message = reader.read_all({topic})[0]
             try:
                 values = loads(message.data, node, ESTIMATOR_PARAMETERS)

@@ -2,16 +2,12 @@
 """Command-line options that several commands share."""
 
 import argparse
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
-from fhaosmo_ros.core.parameters.declaration import (
-    Parameters,
-    ParameterTable,
-    unknown_parameter,
-)
+from fhaosmo_ros.core.parameters.declaration import Parameters, ParameterTable
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.files import read, select, with_origin
 from fhaosmo_ros.core.parameters.per_channel import of_named_channel
@@ -53,15 +49,9 @@ def add_parameter_options(parser: argparse.ArgumentParser) -> None:
 
 def channel_parameters(
     arguments: argparse.Namespace, recorded: Recorded | None = None
-) -> dict[str, Any]:
+) -> Parameters:
     """
-    Return the parameters of a channel from the options.
-
-    Parameters
-    ----------
-    arguments : Namespace
-    recorded : Recorded, optional
-        What files and -p change.
+    Return the parameters of a channel: those `recorded`, changed by files, and these by -p.
 
     Raises
     ------
@@ -69,13 +59,13 @@ def channel_parameters(
         A file or a value that can't be used, by itself or together with the others.
 
     """
-    values: dict[str, Any] = {}
-    origins: dict[str, Path | str | None] = {}
-    given: list[tuple[Path | str | None, Mapping[str, Any]]] = []
+    given: list[tuple[Any, dict[str, Any]]] = []
     if recorded:
         given.append((f'topic {recorded.topic!r}', recorded.values))
     given += [(path, read(path, arguments.node, strict=True)) for path in arguments.params_file]
-    for origin, found in [*given, (None, _on_command_line(arguments))]:
+    values: dict[str, Any] = {}
+    origins: dict[str, Any] = {}
+    for origin, found in [*given, (None, dict(_rules(arguments.param)))]:
         values |= found
         origins |= dict.fromkeys(found, origin)
     try:
@@ -83,16 +73,17 @@ def channel_parameters(
     except ConfigurationError as error:
         raise with_origin(error, origins) from None
     own = of_named_channel(with_joints(values), arguments.channel, '--channel')
+    parameters = CHANNEL_PARAMETERS.complete(Parameters(ESTIMATOR_PARAMETERS, own))
     try:
-        OnlineEstimator(Parameters(ESTIMATOR_PARAMETERS, own))
+        OnlineEstimator(parameters)
     except ConfigurationError as error:
         raise with_origin(error, origins, arguments.channel) from None
-    return CHANNEL_PARAMETERS.part_of(own)
+    return parameters
 
 
 def named(arguments: argparse.Namespace) -> list[str]:
     """Return the parameters of the update path that -p sets."""
-    names = [name.removeprefix(f'{arguments.channel}.') for name in _on_command_line(arguments)]
+    names = [name.removeprefix(f'{arguments.channel}.') for name, _ in _rules(arguments.param)]
     return [name for name in names if name in ONLINE_PARAMETERS]
 
 
@@ -106,18 +97,7 @@ def assigned(rules: Sequence[str], table: ParameterTable) -> dict[str, Any]:
         A rule that is none, an unknown name, or a bad value.
 
     """
-    values = dict(_rules(rules))
-    for name in values:
-        if name not in table:
-            raise unknown_parameter(name, table)
-    return dict(table.coerce(values))
-
-
-def _on_command_line(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Return what -p sets of this node; as on a command line of ROS it may be for another."""
-    own = ('', arguments.node.strip('/'))
-    split = [(target.rpartition(':'), value) for target, value in _rules(arguments.param)]
-    return {name: value for (node, _, name), value in split if node.strip('/') in own}
+    return table.coerce(dict(_rules(rules)))
 
 
 def _rules(rules: Sequence[str]) -> Iterator[tuple[str, Any]]:

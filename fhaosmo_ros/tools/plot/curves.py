@@ -59,8 +59,8 @@ def read_curves(path: Path, names: list[str] | None, plant: str) -> list[Curves]
     """
     with BagReader(path) as reader:
         topics = {c.topic for c in reader.connections if c.msgcount}
-        candidates = sorted({topic.rpartition('/')[0] for topic in topics})
-        found = [n for n in candidates if topics.issuperset(f'{n}/{part}' for part in ESTIMATES)]
+        first, *others = map(reader.names_above, ESTIMATES)
+        found = [name for name in first if all(name in other for other in others)]
         if wrong := [name for name in names or [] if name not in found]:
             raise ConfigurationError(
                 f'bag {path}: expected estimates of one of {", ".join(found) or "none"}, '

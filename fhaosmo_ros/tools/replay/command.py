@@ -9,13 +9,14 @@ import sys
 from tempfile import TemporaryDirectory
 from time import perf_counter
 
+from fhaosmo_ros.core.model.triangular import TriangularModel
 from fhaosmo_ros.core.observer.estimates import Trajectory
 from fhaosmo_ros.core.observer.status import UNUSED
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.online.events import Event
 from fhaosmo_ros.core.parameters.declaration import ParameterTable
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
-from fhaosmo_ros.core.parameters.tables import CHANNEL_PARAMETERS, INPUT, ONLINE_PARAMETERS
+from fhaosmo_ros.core.parameters.tables import INPUT
 from fhaosmo_ros.stop_signals import Stop
 from fhaosmo_ros.tools.bags.inputs import BagInputs
 from fhaosmo_ros.tools.bags.reader import BagReader, FieldSamples
@@ -84,8 +85,7 @@ def _replay(arguments: argparse.Namespace, stop: Stop) -> None:
     with ExitStack() as stack:
         if is_table:
             path = Path(stack.enter_context(TemporaryDirectory()), 'table')
-            own = channel_parameters(arguments)
-            used = OnlineEstimator(ONLINE_PARAMETERS.part_of(own)).observer.used_inputs
+            used = TriangularModel.of(channel_parameters(arguments)).used_inputs
             bag_of_table(arguments.bag, arguments.columns, used, path)
         reader = stack.enter_context(BagReader(path))
         followed = recorded = live = None
@@ -95,19 +95,19 @@ def _replay(arguments: argparse.Namespace, stop: Stop) -> None:
             recorded = recorded_parameters(reader, followed)
         if recorded:
             arguments.channel = arguments.channel or recorded.channel
-        own = channel_parameters(arguments, recorded)
+        values = channel_parameters(arguments, recorded)
         if is_table:
             # The file says where y and u are, not the topics of a node.
-            own = {k: v for k, v in own.items() if k not in ParameterTable(INPUT)}
+            values = values.changed(ParameterTable(INPUT).defaults())
         if arguments.smooth:
-            own['smoothing_lag'] = 0.0
-        estimator = OnlineEstimator(ONLINE_PARAMETERS.part_of(own))
+            values = values.changed({'smoothing_lag': 0.0})
+        estimator = OnlineEstimator(values)
         if arguments.smooth:
             estimator.smooth()
         if followed is not None:
             live = LiveRun(reader, followed, estimator, named(arguments))
         namespace = recorded.namespace if recorded else arguments.node.rpartition('/')[0]
-        values, model = CHANNEL_PARAMETERS.defaults() | own, estimator.observer.model
+        model = estimator.observer.model
         inputs = BagInputs(reader, values, model, namespace, arguments.channel)
         finals = arguments.output or [Path(f'{bag_name}_replayed')]
         outputs = [stack.enter_context(Output(path, arguments.force)) for path in finals]
@@ -128,9 +128,8 @@ def _replay(arguments: argparse.Namespace, stop: Stop) -> None:
             u = None
             if estimator.observer.used_inputs:
                 u = inputs.at(samples, estimator.inputs, estimator.reject_inputs)
-            parameters = ONLINE_PARAMETERS.defaults() | own
             sinks = [
-                files.enter_context(sink(o.path, reader, name, estimator.observer, parameters))
+                files.enter_context(sink(o.path, reader, name, estimator.observer, values))
                 for o in outputs
             ]
             for rows in _estimates(estimator, live, samples, u, arguments.smooth):
@@ -144,10 +143,6 @@ def _replay(arguments: argparse.Namespace, stop: Stop) -> None:
     )
     for why, count in reader.lacking.items():
         print(f'{count} messages left out: {why}')
-    if estimator.smoothing is not None:
-        lag = estimator.parameters['smoothing_lag']
-        later = 'and after' if arguments.smooth else f'and until {lag:g} s after'
-        print(f'smoothed: each estimate by the samples before {later} it')
     print(f'stamps: {stamps}')
     origin = f'{recorded.topic} in the bag' if recorded else 'the defaults'
     if arguments.params_file:

@@ -47,11 +47,7 @@ def find_estimator(reader: BagReader, name: str | None, channel: str = '') -> st
         The one given has no snapshots in the bag, or none is given and there are several.
 
     """
-    found = sorted(
-        c.topic.removesuffix(f'/{SNAPSHOT}')
-        for c in reader.connections
-        if c.topic.endswith(f'/{SNAPSHOT}') and c.msgcount
-    )
+    found = reader.names_above(SNAPSHOT)
     if name is not None and name not in found:
         raise ConfigurationError(
             f'--follow: expected an estimator whose snapshots are in the bag '

@@ -115,7 +115,7 @@ def bag_sink(
 
     """
     text: bytes | None = types.serialise(TEXT, data=dumps(parameters, name))
-    unit = derivative_unit(parameters.get('measurement_unit', ''), observer.order)
+    unit = derivative_unit(parameters['measurement_unit'], observer.order)
     state = [f'z{i + 1}' for i in range(observer.order)]
     labels = {
         'state': state, 'innovation': [f'eps{i + 1}' for i in range(observer.levels)],
