@@ -3,7 +3,6 @@
 
 import argparse
 from collections.abc import Callable, Sequence
-from errno import EDQUOT, ENOSPC
 from functools import partial
 import os
 from pathlib import Path
@@ -101,7 +100,7 @@ class Output:
     Raises
     ------
     ConfigurationError
-        The path is in use, or it cannot be made.
+        The path is in use.
 
     """
 
@@ -116,22 +115,15 @@ class Output:
 
     def __enter__(self) -> 'Output':
         final = self._final
-        try:
-            empty = not final.exists() or (final.is_dir() and not any(final.iterdir()))
-            if not (empty or self._force):
-                raise ConfigurationError(
-                    f'output {final}: expected a new name (or --force to replace it), got an '
-                    f'existing {"folder with something in it" if final.is_dir() else "file"}'
-                )
-            shutil.rmtree(self._folder, ignore_errors=True)  # of a run that was killed
-            self._folder.mkdir(parents=True)
-        except OSError as error:
-            raise self._unwritable(error) from None
+        empty = not final.exists() or (final.is_dir() and not any(final.iterdir()))
+        if not (empty or self._force):
+            raise ConfigurationError(
+                f'output {final}: expected a new name (or --force to replace it), got an '
+                f'existing {"folder with something in it" if final.is_dir() else "file"}'
+            )
+        shutil.rmtree(self._folder, ignore_errors=True)  # of a run that was killed
+        self._folder.mkdir(parents=True)
         return self
-
-    def _unwritable(self, error: OSError) -> ConfigurationError:
-        problem = f'expected a place that can be written, got: {error.strerror}'
-        return ConfigurationError(f'output {self._final}: {problem}')
 
     def keep(self) -> Path:
         """Give it its final name and return that."""
@@ -139,10 +131,8 @@ class Output:
             self._final.rename(self._folder / 'replaced')
         return self.path.rename(self._final)
 
-    def __exit__(self, _: object, error: BaseException | None, __: object) -> None:
+    def __exit__(self, *_: object) -> None:
         shutil.rmtree(self._folder, ignore_errors=True)
-        if isinstance(error, OSError) and error.errno in (ENOSPC, EDQUOT):  # names no file
-            raise self._unwritable(error) from None
 
 
 def shipped(relative: str) -> Path:
