@@ -2,6 +2,7 @@
 """The protocol of all commands: exit codes, one-line errors, signals, outputs, processes."""
 
 import argparse
+from contextlib import suppress
 from errno import ENOSPC
 import os
 from pathlib import Path
@@ -11,7 +12,7 @@ import sys
 import commands
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.stop_signals import Stop, stop_on_signals, Stopped
-from fhaosmo_ros.tools.cli.command import Output, run_command
+from fhaosmo_ros.tools.cli.command import output_at, run_command
 import pytest
 
 PARSER = argparse.ArgumentParser(prog='try')
@@ -81,19 +82,21 @@ def test_output_replaces_only_what_is_empty_or_forced_and_only_when_it_is_comple
     final = tmp_path / 'out'
     final.mkdir()
     for force, text in ((False, 'new'), (True, 'newer')):
-        with Output(final, force) as output:
-            output.path.write_text(text)
-            assert output.keep() == final
-    with Output(final, force=True) as output:
-        output.path.write_text('half')
+        with output_at(final, force) as path:
+            path.write_text(text)
+        assert final.read_text() == text
+    with suppress(Stopped), output_at(final, force=True) as path:
+        path.write_text('half')
+        raise Stopped
     assert final.read_text() == 'newer'
-    with pytest.raises(ConfigurationError, match='--force'), Output(final):
+    with pytest.raises(ConfigurationError, match='--force'), output_at(final):
         pass
-    with pytest.raises(ConfigurationError, match='No space left'), Output(final, force=True):
+    with pytest.raises(OSError, match=str(final)), output_at(final, force=True):
         raise OSError(ENOSPC, 'No space left on device')
     assert [p.name for p in tmp_path.iterdir()] == ['out']
-    with pytest.raises(ConfigurationError, match='a folder that is in use'):
-        Output(Path('..'), force=True)
+    in_use = pytest.raises(ConfigurationError, match='a folder that is in use')
+    with in_use, output_at(Path('..'), force=True):
+        pass
 
 
 @pytest.fixture
@@ -127,11 +130,11 @@ LOADS = 'import time\nprint("begun", flush=True)\ntime.sleep(600)\n'
 WORKS = """
 import argparse, time, warnings
 from pathlib import Path
-from fhaosmo_ros.tools.cli.command import Output, run_command
+from fhaosmo_ros.tools.cli.command import output_at, run_command
 
 def body(arguments, stop):
-    with Output(Path(__file__).with_name('out')) as output, stop.raising():
-        output.path.mkdir()
+    with output_at(Path(__file__).with_name('out')) as path, stop.raising():
+        path.mkdir()
         warnings.filterwarnings('always', 'odd')
         for _ in range(2):
             warnings.warn('odd')

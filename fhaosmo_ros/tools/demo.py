@@ -16,7 +16,7 @@ from fhaosmo_ros.core.parameters.files import load
 from fhaosmo_ros.stop_signals import Stop, Stopped
 from fhaosmo_ros.tools.bags.topics import series
 from fhaosmo_ros.tools.bags.writer import BagWriter
-from fhaosmo_ros.tools.cli.command import Output, progress, run_command, shipped
+from fhaosmo_ros.tools.cli.command import output_at, progress, run_command, shipped
 from fhaosmo_ros.tools.cli.processes import start_node
 from fhaosmo_ros.tools.plot.curves import Curves, metrics, read_curves
 from fhaosmo_ros.tools.plot.figures import save_curves
@@ -89,9 +89,8 @@ def _demo(arguments: argparse.Namespace, stop: Stop) -> None:
         f'plant and estimator with {parameters}, on this host only, '
         f'ROS_DOMAIN_ID={os.environ["ROS_DOMAIN_ID"]}'
     )
-    default = Path('demo_output') / time.strftime('%Y-%m-%d_%H-%M-%S')
-    with Output(arguments.output or default, arguments.force) as output:
-        folder = output.path
+    final = arguments.output or Path('demo_output') / time.strftime('%Y-%m-%d_%H-%M-%S')
+    with output_at(final, arguments.force) as folder:
         folder.mkdir()
         noisy = arguments.params_file is None
         marks = _record(folder, parameters, arguments.duration, noisy, stop)
@@ -102,7 +101,6 @@ def _demo(arguments: argparse.Namespace, stop: Stop) -> None:
         text = report(curves, marks)
         (folder / 'report.txt').write_text(text + '\n', encoding='utf-8')
         print(f'\n{text}\n')
-        final = output.keep()
     print(f'figure:  {final / "demo.png"}\nbag:     {final / "bag"}')
 
 

@@ -19,7 +19,7 @@ from fhaosmo_ros.stop_signals import Stop, Stopped
 from fhaosmo_ros.tools.bags.reader import BagReader
 from fhaosmo_ros.tools.bags.types import header, serialise
 from fhaosmo_ros.tools.bags.writer import BagWriter
-from fhaosmo_ros.tools.cli.command import Output, progress, run_command
+from fhaosmo_ros.tools.cli.command import output_at, progress, run_command
 from fhaosmo_ros.tools.cli.processes import Child, start_node
 from matplotlib.figure import Figure
 import numpy as np
@@ -54,9 +54,8 @@ def _demo(arguments: argparse.Namespace, stop: Stop) -> None:
     urdf = urdf_of(ROBOT)
     model = ArmModel(urdf)
     world = simulate(urdf, model, DURATION, SEED, wall=True, balls=BALLS, push=PUSH)
-    default = Path('demo_output') / time.strftime('%Y-%m-%d_%H-%M-%S')
-    with Output(arguments.output or default, arguments.force) as output:
-        folder = output.path
+    final = arguments.output or Path('demo_output') / time.strftime('%Y-%m-%d_%H-%M-%S')
+    with output_at(final, arguments.force) as folder:
         folder.mkdir()
         (folder / 'robot.urdf').write_text(urdf, encoding='utf-8')
         _write(folder / 'robot', model, world)
@@ -66,7 +65,7 @@ def _demo(arguments: argparse.Namespace, stop: Stop) -> None:
         text = _table(world, torque, by_gain, events)
         (folder / 'report.txt').write_text(text + '\n', encoding='utf-8')
         _figure(world, torque, by_gain, events).savefig(folder / 'demo_arm.png', dpi=110)
-        print(f'\n{text}\n\nfigure: {output.keep() / "demo_arm.png"}')
+    print(f'\n{text}\n\nfigure: {final / "demo_arm.png"}')
 
 
 def _write(path: Path, model: ArmModel, world: Touched) -> None:

@@ -15,7 +15,7 @@ from fhaosmo_ros.stop_signals import Stop
 from fhaosmo_ros.tools.arm import recording
 from fhaosmo_ros.tools.arm.figure import torque_figure
 from fhaosmo_ros.tools.bags.reader import BagReader
-from fhaosmo_ros.tools.cli.command import Output, run_command
+from fhaosmo_ros.tools.cli.command import output_at, run_command
 import numpy as np
 
 LEAST = 1.0
@@ -80,13 +80,14 @@ def _calibrate(arguments: argparse.Namespace, stop: Stop) -> None:
     print('In parts of the recording that were held out:')
     print(_table(arm.joints, 'URDF', 'calibrated', found.before, found.after))
     print(*found.notes, sep='\n')
-    with Output(arguments.output, arguments.force) as output:
+    with output_at(arguments.output, arguments.force) as path:
         text = replace(found.calibration, log_odds=level).dumps()
-        output.path.write_text(text, encoding='utf-8')
-        print(f'calibration: {output.keep()}')
-    with Output(arguments.output.with_suffix('.png'), arguments.force) as output:
-        torque_figure(arm.joints, found).savefig(output.path, dpi=110)
-        print(f'figure:      {output.keep()}')
+        path.write_text(text, encoding='utf-8')
+    print(f'calibration: {arguments.output}')
+    figure = arguments.output.with_suffix('.png')
+    with output_at(figure, arguments.force) as path:
+        torque_figure(arm.joints, found).savefig(path, dpi=110)
+    print(f'figure:      {figure}')
 
 
 def _table(joints: Sequence[str], without: str, with_: str, *left: Floats) -> str:

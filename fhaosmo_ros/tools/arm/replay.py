@@ -11,7 +11,7 @@ from fhaosmo_ros.core.arm.arm import Arm
 from fhaosmo_ros.stop_signals import Stop
 from fhaosmo_ros.tools.arm import recording
 from fhaosmo_ros.tools.bags.reader import BagReader
-from fhaosmo_ros.tools.cli.command import Output, run_command
+from fhaosmo_ros.tools.cli.command import output_at, run_command
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -33,10 +33,10 @@ def _replay(arguments: argparse.Namespace, stop: Stop) -> None:
     with stop.raising(), BagReader(arguments.bag) as reader:
         arm = Arm(recording.description(reader, arguments), recording.arm_parameters(arguments))
         samples = recording.joint_samples(reader, arguments.topic, arm)
-        with Output(arguments.output, arguments.force) as output:
-            contacts = _write(arm, samples, output.path)
-            used = arm.counters.pop('used', 0)
-            print(f'{used} samples used, {contacts} contacts: {output.keep()}')
+        with output_at(arguments.output, arguments.force) as path:
+            contacts = _write(arm, samples, path)
+    used = arm.counters.pop('used', 0)
+    print(f'{used} samples used, {contacts} contacts: {arguments.output}')
     for what, count in arm.counters.items():
         print(f'{what}: {count} samples')
 

@@ -4,7 +4,6 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from fhaosmo_ros.core.parameters.declaration import suggestion
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.tools.bags.types import serialise, with_numbers
 from fhaosmo_ros.tools.bags.writer import BagWriter
@@ -56,17 +55,11 @@ def bag_of_table(path: Path, wanted: str, used: Sequence[str], bag: Path) -> Non
         del lines[0]
     columns = [title.strip() for title in wanted.split(',') if title.strip()]
     columns = columns or titles[: len(names)]
-    if len(columns) != len(names):
+    if len(columns) != len(names) or not set(columns) <= set(titles):
         raise ConfigurationError(
-            f'--columns: expected {len(names)} titles, of {", ".join(names)}, got '
-            f'{", ".join(columns)}'
+            f'--columns: expected {len(names)} titles of {path}, which are {", ".join(titles)}: '
+            f'of {", ".join(names)}, got {", ".join(columns)}'
         )
-    for title in columns:
-        if title not in titles:
-            raise ConfigurationError(
-                f'--columns: expected titles of {path}, which are {", ".join(titles)}, '
-                f'got {title!r}{suggestion(title, titles)}'
-            )
     if not lines:
         raise ConfigurationError(f'{path}: expected lines of numbers, got none')
     places = [titles.index(title) for title in columns]

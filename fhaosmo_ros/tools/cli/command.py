@@ -2,7 +2,8 @@
 """What all commands share: arguments, signals, one-line errors, exit codes, output, progress."""
 
 import argparse
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import partial
 import os
 from pathlib import Path
@@ -80,22 +81,21 @@ def without_password(text: str) -> str:
     return re.sub(r'(://[^:/@\s]*:)\S*@', r'\1***@', text)
 
 
-class Output:
+@contextmanager
+def output_at(final: Path, force: bool = False) -> Iterator[Path]:
     """
-    A file or folder that is made in a hidden folder beside its place, and moved once complete.
+    Yield where to write a file or folder meanwhile, and move it to its place once complete.
+
+    It is complete when the block ends without an error; else nothing stays, and what was there
+    before does. The path that is yielded has the final name, in a hidden folder beside its place,
+    and does not exist yet.
 
     Parameters
     ----------
     final : path
-        Must be absent or an empty folder, unless `force`. What is there stays until the new one
-        is complete.
+        Must be absent or an empty folder, unless `force`.
     force : bool
         Replace what is there.
-
-    Attributes
-    ----------
-    path : path
-        Where to write meanwhile: has the final name, and does not exist yet; its folder does.
 
     Raises
     ------
@@ -103,36 +103,28 @@ class Output:
         The path is in use.
 
     """
-
-    def __init__(self, final: Path, force: bool = False) -> None:
-        if final.name in ('', '..'):  # nothing could be renamed to it
-            raise ConfigurationError(
-                f'output {final}: expected a name, got a folder that is in use'
-            )
-        self._final, self._force = final, force
-        self._folder = final.with_name(f'.{final.name}.part')
-        self.path = self._folder / final.name
-
-    def __enter__(self) -> 'Output':
-        final = self._final
-        empty = not final.exists() or (final.is_dir() and not any(final.iterdir()))
-        if not (empty or self._force):
-            raise ConfigurationError(
-                f'output {final}: expected a new name (or --force to replace it), got an '
-                f'existing {"folder with something in it" if final.is_dir() else "file"}'
-            )
-        shutil.rmtree(self._folder, ignore_errors=True)  # of a run that was killed
-        self._folder.mkdir(parents=True)
-        return self
-
-    def keep(self) -> Path:
-        """Give it its final name and return that."""
-        if self._final.exists():
-            self._final.rename(self._folder / 'replaced')
-        return self.path.rename(self._final)
-
-    def __exit__(self, *_: object) -> None:
-        shutil.rmtree(self._folder, ignore_errors=True)
+    if final.name in ('', '..'):  # nothing could be renamed to it
+        raise ConfigurationError(f'output {final}: expected a name, got a folder that is in use')
+    empty = not final.exists() or (final.is_dir() and not any(final.iterdir()))
+    if not (empty or force):
+        raise ConfigurationError(
+            f'output {final}: expected a new name (or --force to replace it), got an existing '
+            f'{"folder with something in it" if final.is_dir() else "file"}'
+        )
+    folder = final.with_name(f'.{final.name}.part')
+    shutil.rmtree(folder, ignore_errors=True)  # of a run that was killed
+    folder.mkdir(parents=True)
+    try:
+        yield folder / final.name
+        if final.exists():
+            final.rename(folder / 'replaced')
+        (folder / final.name).rename(final)
+    except OSError as error:
+        if error.filename is None:  # of a write, such as to a disk that is full
+            raise OSError(error.errno, error.strerror, str(final)) from None
+        raise
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 def shipped(relative: str) -> Path:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.stop_signals import Stop
-from fhaosmo_ros.tools.cli.command import Output, run_command
+from fhaosmo_ros.tools.cli.command import output_at, run_command
 from fhaosmo_ros.tools.plot.curves import metrics, read_curves
 from fhaosmo_ros.tools.plot.figures import save_curves
 
@@ -41,9 +41,8 @@ def _plot(arguments: argparse.Namespace, stop: Stop) -> None:
         curves = [
             c for bag in arguments.bags for c in read_curves(bag, arguments.names, arguments.plant)
         ]
-    with Output(path, arguments.force) as output:  # not within raising: it leaves nothing behind
-        with stop.raising():
-            save_curves(curves, output.path)
-        final = output.keep()
+    # Not within raising: it leaves nothing behind.
+    with output_at(path, arguments.force) as figure, stop.raising():
+        save_curves(curves, figure)
     late = [c.part(slice(len(c.stamps) // 2, None)) for c in curves]
-    print(f'{metrics(late, "2nd half")}\nfigure: {final}', flush=True)
+    print(f'{metrics(late, "2nd half")}\nfigure: {path}', flush=True)

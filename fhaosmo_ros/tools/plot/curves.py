@@ -61,15 +61,11 @@ def read_curves(path: Path, names: list[str] | None, plant: str) -> list[Curves]
         topics = {c.topic for c in reader.connections if c.msgcount}
         first, *others = map(reader.names_above, ESTIMATES)
         found = [name for name in first if all(name in other for other in others)]
-        if wrong := [name for name in names or [] if name not in found]:
+        if not found or not set(names or ()) <= set(found):
             raise ConfigurationError(
-                f'bag {path}: expected estimates of one of {", ".join(found) or "none"}, '
-                f'got {wrong[0]!r}'
-            )
-        if not found:
-            raise ConfigurationError(
-                f'bag {path}: expected the topics of an estimator ({", ".join(ESTIMATES)} below '
-                f'its name), got {", ".join(sorted(topics)) or "none"}; replay adds them'
+                f'bag {path}: expected estimates (topics {", ".join(ESTIMATES)}, which replay '
+                f'adds) of {", ".join(names or ["an estimator"])}, got those of '
+                f'{", ".join(found) or "none"}'
             )
         return [_curves(reader, name, plant, topics) for name in names or found]
 

@@ -22,7 +22,7 @@ from fhaosmo_ros.tools.bags.inputs import BagInputs
 from fhaosmo_ros.tools.bags.reader import BagReader, FieldSamples
 from fhaosmo_ros.tools.bags.table import bag_of_table
 from fhaosmo_ros.tools.bags.topics import recorded_parameters
-from fhaosmo_ros.tools.cli.command import Output, run_command
+from fhaosmo_ros.tools.cli.command import output_at, run_command
 from fhaosmo_ros.tools.cli.options import add_parameter_options, channel_parameters, named
 from fhaosmo_ros.tools.replay.live_run import find_estimator, LiveRun
 from fhaosmo_ros.tools.replay.sinks import Rows, sink, TABLES
@@ -110,7 +110,7 @@ def _replay(arguments: argparse.Namespace, stop: Stop) -> None:
         model = estimator.observer.model
         inputs = BagInputs(reader, values, model, namespace, arguments.channel)
         finals = arguments.output or [Path(f'{bag_name}_replayed')]
-        outputs = [stack.enter_context(Output(path, arguments.force)) for path in finals]
+        outputs = [stack.enter_context(output_at(path, arguments.force)) for path in finals]
         name = _name({c.topic for c in reader.connections}, arguments.name)
         with stop.raising(), ExitStack() as files:
             samples, field = inputs.samples()
@@ -129,13 +129,12 @@ def _replay(arguments: argparse.Namespace, stop: Stop) -> None:
             if estimator.observer.used_inputs:
                 u = inputs.at(samples, estimator.inputs, estimator.reject_inputs)
             sinks = [
-                files.enter_context(sink(o.path, reader, name, estimator.observer, values))
-                for o in outputs
+                files.enter_context(sink(path, reader, name, estimator.observer, values))
+                for path in outputs
             ]
             for rows in _estimates(estimator, live, samples, u, arguments.smooth):
                 for write in sinks:
                     write(rows)
-        finals = [output.keep() for output in outputs]
     c = estimator.counters
     print(
         f'{c.accepted} samples used, {c.rejected} rejected, {c.restarts} restarts; '

@@ -15,7 +15,7 @@ from fhaosmo_ros.core.simulation.recordings import SENSOR
 from fhaosmo_ros.stop_signals import Stop
 from fhaosmo_ros.tools.bags.inputs import BagInputs
 from fhaosmo_ros.tools.bags.reader import BagReader
-from fhaosmo_ros.tools.cli.command import Output, run_command
+from fhaosmo_ros.tools.cli.command import output_at, run_command
 from fhaosmo_ros.tools.cli.options import add_value_options, assigned
 from fhaosmo_ros.tools.tuning import report
 from fhaosmo_ros.tools.tuning.identify import identify_input, make_gains
@@ -72,7 +72,7 @@ def _tune(arguments: argparse.Namespace, stop: Stop) -> None:
             f'{arguments.trials}, {arguments.jobs} and {arguments.seed}'
         )
     estimator, tuning = read_parameters(arguments.params_file, arguments.param)
-    with Output(arguments.output, arguments.force) as output:
+    with output_at(arguments.output, arguments.force) as folder:
         if arguments.bag:
             with stop.raising():
                 parameters, text = _of_bag(arguments.bag, estimator, tuning)
@@ -85,11 +85,10 @@ def _tune(arguments: argparse.Namespace, stop: Stop) -> None:
             jobs = arguments.jobs or os.cpu_count() or 1
             result = tuner.search(arguments.trials, jobs, arguments.storage, stop.is_set)
             parameters, text = report.of_search(tuner, result)
-        report.save(output.path, arguments.command_line, parameters, text)
-        folder = output.keep()
-    print(f'\n{text}\n')
-    print(f'output: {folder}/gains.yaml, report.md')
-    print(f'use it: ros2 run fhaosmo_ros estimator --ros-args --params-file {folder}/gains.yaml')
+        report.save(folder, arguments.command_line, parameters, text)
+    gains = arguments.output / 'gains.yaml'
+    print(f'\n{text}\n\noutput: {gains}, report.md')
+    print(f'use it: ros2 run fhaosmo_ros estimator --ros-args --params-file {gains}')
 
 
 def _of_bag(

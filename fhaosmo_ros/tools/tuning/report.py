@@ -36,7 +36,7 @@ def of_search(tuner: Tuner, result: Result) -> tuple[dict[str, Any], str]:
     """Return the gains for a simulated family, and a report of them."""
     best, begin = result.best, {d.name: d.start for d in tuner.space}
     columns, found = [''], []
-    for title, values in (('given' if tuner.given else 'start', begin), ('tuned', best)):
+    for title, values in (('start', begin), ('tuned', best)):
         for data, objective in (('training', tuner.training), ('held out', tuner.held_out)):
             columns.append(f'{title}, {data}')
             found.append(objective(tuner.parameters(values)))
@@ -45,15 +45,10 @@ def of_search(tuner: Tuner, result: Result) -> tuple[dict[str, Any], str]:
     rows = [['error, relative to the truth', *(f'{e.error:.4f}' for e in found)]]
     for name, of_name in zip(names, errors, strict=True):
         rows.append([f'RMS error of {name}', *(f'{error:.3g}' for error in of_name)])
-    searched = [
-        [d.name, *(f'{x:.4g}' for x in (d.low, d.high, d.start, best[d.name]))]
-        for d in tuner.space
-    ]
     text = '\n\n'.join([
         f'{result.trials} trials on {len(tuner.training.recordings)} simulated recordings; '
         f'{len(tuner.held_out.recordings)} others, held out, took no part in the search.',
         table(columns, rows),
-        table(['parameter', 'from', 'to', 'start', 'tuned'], searched),
     ])  # fmt: skip
     return tuner.parameters(best), text
 

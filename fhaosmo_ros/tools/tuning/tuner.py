@@ -94,7 +94,6 @@ class Tuner:
     ) -> None:
         self.tuning, self._seed = tuning, seed
         self._period = rounded(float(np.median(np.diff(training[0].t))))
-        self.given = 'lambda' in estimator  # the search begins with gains that the user set
         # The estimator may have a model of its own, other than the plant's.
         own = {name: tuning[name] for name in ('order', 'phi')} | dict(estimator)
         self._noise, self._fixed = 0.0, own
