@@ -170,7 +170,9 @@ def test_bag_tables_and_figure_have_what_the_node_finds(samples, tmp_path, monke
     found, events = np.array(found), estimator.events.taken()
     assert [e.begins for e in events[:2]] == [True, False]
     of_bag = series(bag, '/estimator/tuning')
-    assert of_bag.labels == TUNING
+    with BagReader(bag) as reader:
+        _, _, message, _ = next(reader.objects(['/estimator/tuning']))
+    assert message.layout.dim[0].label.split(',') == TUNING
     np.testing.assert_array_equal(of_bag.values, found[:, :7])
     of_csv = np.genfromtxt(csv, delimiter=',', names=True)
     names = [*(f'tuning_{name}' for name in TUNING), 'event', 'std_z1', 'std_unknown_input']

@@ -28,7 +28,6 @@ class Series(NamedTuple):
 
     stamps: NDArray[np.int64]  # (K,) in nanoseconds
     values: NDArray[Any]  # (K,) or (K, n), of Float64, Float64MultiArray, or Time (ns, integers)
-    labels: list[str]  # names of the n columns, where the messages have a label
 
 
 def series(path: Path, topic: str) -> Series:
@@ -42,7 +41,6 @@ def series(path: Path, topic: str) -> Series:
 
     """
     stamps, values = [np.zeros(0, np.int64)], []
-    labels: list[str] = []
     with BagReader(path) as reader:
         rows = reader.objects([topic]) if reader.count(topic) else iter(())
         while block := list(islice(rows, BLOCK)):  # arrays take less memory than messages
@@ -53,10 +51,7 @@ def series(path: Path, topic: str) -> Series:
                 raise ConfigurationError(
                     f'topic {topic!r}: expected lists of one length, got several'
                 ) from None
-            first = block[0][2]
-            if not labels and hasattr(first, 'layout') and first.layout.dim:
-                labels = first.layout.dim[0].label.split(',')
-    return Series(np.concatenate(stamps), np.concatenate(values or [np.zeros(0)]), labels)
+    return Series(np.concatenate(stamps), np.concatenate(values or [np.zeros(0)]))
 
 
 def _numbers(message: Any) -> Any:

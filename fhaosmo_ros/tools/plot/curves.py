@@ -87,11 +87,10 @@ def _curves(reader: BagReader, name: str, plant: str, topics: set[str]) -> Curve
     truth = _truth_at(path, plant, when)
     if truth is not None and truth.shape != estimate.shape:
         truth = None  # of another model
-    labels = series(path, f'{name}/state').labels
     return Curves(
         f'{path.resolve().name} {name}',
         when,
-        [*(labels or [f'z{i + 1}' for i in range(estimate.shape[1] - 1)]), 'd'],
+        [*(f'z{i + 1}' for i in range(estimate.shape[1] - 1)), 'd'],
         estimate,
         ticks['innovation'],
         ticks.get('gamma'),
