@@ -109,8 +109,9 @@ def _check(text: str) -> None:
             raise _refused(event, f'lists or mappings nested deeper than {MAX_DEPTH}')
         if isinstance(event, yaml.AliasEvent):
             raise _refused(event, f'the alias *{event.anchor}, which ROS does not read either')
-        if getattr(event, 'tag', None) not in TAGS:
-            raise _refused(event, f'the tag {event.tag!r}')
+        tag = getattr(event, 'tag', None)
+        if tag not in TAGS:
+            raise _refused(event, f'the tag {tag!r}')
 
 
 def _refused(place: Any, problem: str) -> ConfigurationError:

@@ -127,8 +127,6 @@ def read_parameters(files: list[Path], rules: list[str]) -> tuple[dict[str, Any]
         # Where only the estimator has a model, the plant has the same one; and so the sensor.
         tuning |= ParameterTable(MODEL, SENSOR).part_of(found)
         tuning |= load(path, 'plant', TUNE_PARAMETERS) | load(path, 'tune', TUNE_PARAMETERS)
-    for name, value in assigned(rules, BOTH).items():
-        for table, values in ((ESTIMATOR_PARAMETERS, estimator), (TUNE_PARAMETERS, tuning)):
-            if name in table:
-                values[name] = value
-    return estimator, tuning
+    given = assigned(rules, BOTH)
+    estimator |= ESTIMATOR_PARAMETERS.part_of(given)
+    return estimator, tuning | TUNE_PARAMETERS.part_of(given)
