@@ -133,14 +133,17 @@ def recorded_parameters(reader: BagReader, name: str | None = None) -> Recorded 
         They are not parameters of this version.
 
     """
-    nodes = reader.names_above(PARAMETERS)
+    nodes = [
+        node for node in reader.names_above(PARAMETERS)
+        if reader.message_type(f'{node}/{PARAMETERS}') == TEXT
+    ]  # fmt: skip
     if name is None:
         if len(nodes) != 1:
             return None
         name = nodes[0]
     for node in (name, name.rpartition('/')[0]):
         topic = f'{node}/{PARAMETERS}'
-        if node in nodes and reader.message_type(topic) == TEXT:
+        if node in nodes:
             _, _, message = reader.read_all({topic})[0]
             try:
                 values = loads(message.data, node, ESTIMATOR_PARAMETERS)
