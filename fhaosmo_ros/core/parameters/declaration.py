@@ -313,8 +313,5 @@ def shown(value: Any) -> str:
         value = value.tolist()
     elif isinstance(value, Iterable) and not isinstance(value, str | bytes | Mapping):
         value = list(value)
-    try:
-        text = repr(value)
-    except ValueError:  # Python prints at most 4,300 digits
-        text = 'a longer integer'
+    text = repr(value)
     return text if len(text) <= 120 else text[:117] + '...'
