@@ -31,7 +31,7 @@ REFUSED = [
      ["5.yaml: unknown parameter 'lamda'", "mean 'lambda'?"]),
     (E, [*set_in_file('lambda: [-3.0]'), '-p', 'lambda:=[-4.0]'], ["parameter 'lambda'", '-4.0']),
     (P, ['--ros-args', '-r', '__node:=plans', '--params-file', OF_PLANT],
-     ["got 'plant'; did you mean '/plans'"]),
+     ["expected a section '/plans' or '/**', got plant"]),
     (P, ['--ros-args', '--params-file', '/nowhere/demo.yaml'],
      ['/nowhere/demo.yaml', 'expected a readable file', 'No such file']),
     ('arm', rules('robot_description_file:=/none.urdf'), ["'robot_description_file': expected"]),
