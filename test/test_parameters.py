@@ -9,6 +9,7 @@ import warnings
 from fhaosmo_ros.core import ConfigurationError, Observer
 from fhaosmo_ros.core.parameters.declaration import Parameter
 from fhaosmo_ros.core.parameters.files import complete, dumps, load, loads, select
+from fhaosmo_ros.core.parameters.removed import REMOVED
 from fhaosmo_ros.core.parameters.tables import (
     CHANNEL_PARAMETERS,
     ESTIMATOR_PARAMETERS,
@@ -80,14 +81,17 @@ def test_all_else_is_refused_in_one_line(kind, allowed, values):
         assert message.endswith("got 'fuzy'; did you mean 'fuzzy'?") == (value == 'fuzy')
 
 
-def test_unknown_names_are_told():
+def test_unknown_and_old_names_are_told():
     for table in NODE_TABLES.values():
         name = next(iter(table))
         with pytest.raises(ConfigurationError, match=f"unknown parameter '{name}x'.*{name}"):
             table.coerce({name + 'x': 1.0})
-    for wrong, values in (('max_step', {}), ('hip.max_step', {'channels': ['hip']})):
-        with pytest.raises(ConfigurationError, match=f"unknown parameter '{wrong}'"):
-            complete(values | {wrong: 1.0}, ESTIMATOR_PARAMETERS)
+        assert not REMOVED.keys() & table.keys()
+    for name, successor in REMOVED.items():
+        for wrong, values in ((name, {}), (f'hip.{name}', {'channels': ['hip']})):
+            with pytest.raises(ConfigurationError) as error:
+                complete(values | {wrong: 1.0}, ESTIMATOR_PARAMETERS)
+            assert str(error.value) == f"parameter '{wrong}' is gone: {successor}"
 
 
 @pytest.mark.parametrize(('values', 'reason'), [

@@ -10,6 +10,7 @@ import re
 from typing import Any, TypeAlias
 
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
+from fhaosmo_ros.core.parameters.removed import REMOVED
 from fhaosmo_ros.core.parameters.yaml_text import parse
 import numpy as np
 
@@ -295,7 +296,10 @@ class Parameters(dict[str, Any]):
 
 
 def unknown_parameter(name: str, known: Iterable[str]) -> ConfigurationError:
-    """Build the error for a name that nobody declared."""
+    """Build the error for a name that nobody declared, or that is declared no more."""
+    successor = REMOVED.get(name.rpartition('.')[2])
+    if successor:
+        return ConfigurationError(f"parameter '{name}' is gone: {successor}")
     known = list(known)
     hint = suggestion(name, known) or '; known are ' + ', '.join(known)
     return ConfigurationError(f"unknown parameter '{name}'{hint}")

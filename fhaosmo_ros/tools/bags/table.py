@@ -45,7 +45,7 @@ def bag_of_table(path: Path, wanted: str, used: Sequence[str], bag: Path) -> Non
     names = ['the time', 'y', *used]
     with path.open(encoding='utf-8-sig') as file:
         lines = file.readlines()
-    if not lines:
+    if not any(map(str.strip, lines)):
         raise ConfigurationError(f'{path}: expected lines of numbers, got an empty file')
     delimiter = next((mark for mark in DELIMITERS if mark in lines[0]), None)
     titles = [cell.strip('# "\n') for cell in lines[0].split(delimiter)]
