@@ -7,7 +7,6 @@ install, `ros2 run fhaosmo_ros COMMAND [ARGUMENTS]` in a workspace.
 """
 
 from collections.abc import Callable
-import difflib
 from functools import partial
 import gc
 import importlib
@@ -44,10 +43,7 @@ def main(argv: list[str] | None = None) -> int:
         print(f'fhaosmo_ros {__version__}')
         return 0
     if name not in COMMANDS:
-        close = difflib.get_close_matches(name, COMMANDS, n=1)
-        hint = f'; did you mean {close[0]!r}?' if close else ''
-        known = ', '.join(COMMANDS)
-        print(f'error: no command {name!r} (commands: {known}){hint}', file=sys.stderr)
+        print(f'error: no command {name!r} (commands: {", ".join(COMMANDS)})', file=sys.stderr)
         return 2
     return run(name, rest)
 

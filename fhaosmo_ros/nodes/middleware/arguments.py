@@ -94,10 +94,8 @@ def help_of(name: str, argv: list[str]) -> str:
         return '\n'.join([
             f'usage: {name} {USAGE}', '',
             'The parameters that matter first, and their defaults:', '', *_lines(first), '',
-            f'All of them: {name} --help-parameters; docs/parameters.md says more.',
+            'docs/parameters.md has all of them, and so has ros2 param describe.',
         ])  # fmt: skip
-    if '--help-parameters' in argv:
-        return '\n'.join(_lines([*table.values(), *table.families]))
     return f'fhaosmo_ros {__version__}' if '--version' in argv else ''
 
 
