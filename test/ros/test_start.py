@@ -45,7 +45,7 @@ REFUSED = [
     # Topics and messages.
     (E, rules('input_topic:=/a b'), ["'input_topic'", "'/a b'"]),
     (E, rules('input_topic:=/a', 'input_type:=sensor_msgs/JoinState'),
-     ["'input_type'", "mean 'sensor_msgs/msg/JointState'?"]),
+     ["'input_type'", 'written as in std_msgs/msg/Float64', 'sensor_msgs/JoinState']),
     (E, rules('input_type:=nobody/msg/No'),
      ["'input_type'", 'is installed here', 'nobody/msg/No']),
     (E, rules('input_type:=sensor_msgs/msg/Imu', 'input_field:=angular_velocty.z'),

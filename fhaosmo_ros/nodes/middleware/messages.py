@@ -13,7 +13,6 @@ import site
 from typing import Any
 
 from builtin_interfaces.msg import Time
-from fhaosmo_ros.core.parameters.declaration import suggestion
 from fhaosmo_ros.messages.fields import ARRAY, BASE, NAME, SEQUENCE
 from numpy.typing import NDArray
 from std_msgs.msg import Float64MultiArray, MultiArrayDimension
@@ -60,16 +59,14 @@ def message_class(name: str) -> Any:
         No such message type is installed.
 
     """
-    found = re.fullmatch(r'([a-z][a-z0-9_]*)/(msg/)?([A-Z][A-Za-z0-9]*)', name)
-    hint = '' if found else '; a type is written as in std_msgs/msg/Float64'
+    found = re.fullmatch(r'([a-z][a-z0-9_]*)/msg/([A-Z][A-Za-z0-9]*)', name)
     if found and _is_installed(found[1]):
-        with suppress(ImportError):
-            module = importlib.import_module(f'{found[1]}.msg')
-            if found[2] and hasattr(module, found[3]):
-                return getattr(module, found[3])
-            types = [f'{found[1]}/msg/{word}' for word in dir(module) if word[0].isupper()]
-            hint = suggestion(f'{found[1]}/msg/{found[3]}', types)
-    raise LookupError(f'expected a message type that is installed here, got {name}{hint}')
+        with suppress(ImportError, AttributeError):
+            return getattr(importlib.import_module(f'{found[1]}.msg'), found[2])
+    raise LookupError(
+        'expected a message type that is installed here, written as in std_msgs/msg/Float64, '
+        f'got {name}'
+    )
 
 
 def _is_installed(package: str) -> bool:
