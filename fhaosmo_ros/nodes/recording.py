@@ -10,7 +10,7 @@ from time import time_ns
 from typing import Any
 
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
-from fhaosmo_ros.nodes.middleware.endpoints import subscribe_with_info
+from fhaosmo_ros.nodes.middleware.endpoints import SequenceNumbers, subscribe_with_info
 from fhaosmo_ros.nodes.middleware.messages import message_class
 from fhaosmo_ros.nodes.middleware.spin import GRACE, of_rcl, Spinner
 from fhaosmo_ros.topics import OF_ALL_NODES
@@ -111,9 +111,8 @@ class TopicRecorder(PrivateNode):
 
     Attributes
     ----------
-    counts, lost : Counter of str
-        Messages by topic that have come, and those that did not arrive; the latter only of topics
-        with one publisher, whose messages are numbered.
+    counts : Counter of str
+        Messages by topic that have come.
     problems : list of str
         Lines that say why a topic can't be recorded, or not as a whole.
 
@@ -130,7 +129,7 @@ class TopicRecorder(PrivateNode):
         # Without a limit of time, what is being written is written before the bag is closed.
         super().__init__('fhaosmo_recorder', ros_arguments, grace=None)
         self.counts: Counter[str] = Counter()
-        self.lost: Counter[str] = Counter()
+        self._numbers: dict[str, SequenceNumbers] = {}
         self.problems: list[str] = []
         self._bag, self._everything = bag, everything
         resolved = self.node.resolve_topic_name  # after remapping; names of nodes, too
@@ -146,6 +145,11 @@ class TopicRecorder(PrivateNode):
         self.node.create_timer(FLUSH_PERIOD, lambda: self._write(self._bag.flush))
         super().__enter__()
         return self
+
+    @property
+    def lost(self) -> dict[str, int]:
+        """Messages that did not arrive, by topic; of topics with one publisher only."""
+        return {topic: n.lost for topic, n in self._numbers.items() if n.single and n.lost}
 
     def check(self) -> None:
         """Raise what ended the recording: of the system, such as a full disk, or of a callback."""
@@ -199,20 +203,13 @@ class TopicRecorder(PrivateNode):
             qos.reliability = ReliabilityPolicy.RELIABLE
         if latched := all(p.durability == DurabilityPolicy.TRANSIENT_LOCAL for p in profiles):
             qos.durability = DurabilityPolicy.TRANSIENT_LOCAL
-        numbered = len(profiles) == 1 and topic not in SHARED
+        numbers = self._numbers[topic] = SequenceNumbers()
+        numbers.single = len(profiles) == 1 and topic not in SHARED
         # Measured samples keep their stamps, even those of a clock that is wrong.
         earliest = self._begin - OLD if latched and not measured else 0
-        before = 0
 
         def receive(data: bytes, info: Mapping[str, int]) -> None:
-            nonlocal before, numbered
-            number = info['publication_sequence_number'] or 0  # 0: the middleware has none
-            if 0 < number <= before:  # another publisher: its numbers say nothing
-                numbered = False
-                self.lost.pop(topic, None)
-            elif numbered and before and number > before + 1:
-                self.lost[topic] += number - before - 1
-            before = number
+            numbers.take(info)
             stamp = info['source_timestamp'] or info['received_timestamp']
             stamp = stamp if stamp >= earliest else self._begin
             self._write(self._bag.write, topic, stamp, data)

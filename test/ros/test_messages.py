@@ -35,14 +35,13 @@ def test_bad_messages_are_told_counted_and_survived(user, estimator):
     data.publish(joint_state(SECOND + 2, ['elbow'], []))
     rig.wait_count('messages without y', 2)
     rig.wait_count('samples lost', 1)
-    assert rig.said("got 'elbow'; did you mean 'elbwo'?")
-    assert rig.said("expected an element for each name, got none for 'elbow'")
+    assert rig.said("expected a name that is in the message (elbwo), got 'elbow'")
     data.publish(joint_state(0, ['elbow'], [0.2]))
     rig.wait_count('zero stamps', 1)
-    assert rig.said('its header stamp is 0: nobody fills it; input_stamp: source')
+    assert rig.said('its header stamp is 0: nobody fills it')
     data.publish(joint_state(SECOND + 10 * STEP, ['elbow'], [0.21]))
     rig.wait_count('samples accepted', 2)
-    rig.wait_status('input', WARN, 'header stamps lie', 'another clock')
+    rig.wait_status('input', WARN, 'header stamps lie')
 
 
 def test_bytes_are_numbers():

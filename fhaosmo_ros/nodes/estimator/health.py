@@ -5,15 +5,13 @@ from array import array
 from collections.abc import Mapping
 from math import inf, nan
 from time import perf_counter
-from typing import Any, NamedTuple
+from typing import Any
 
 from fhaosmo_ros.core.online.counters import UNUSED_SAMPLES
-from fhaosmo_ros.core.online.events import described
 from fhaosmo_ros.core.parameters.units import derivative_unit, titled
 from fhaosmo_ros.core.simulation.metrics import high_passed
 from fhaosmo_ros.nodes.middleware.diagnostics import ERROR, Report, STALE, WARN
 import numpy as np
-from numpy.typing import NDArray
 
 WINDOW = 5
 """Samples in the moving average that separates chatter from the signal."""
@@ -26,15 +24,8 @@ RATE_RATIO = 1.5
 """Factor between the rate of y and that of the gains that deserves one."""
 SPREAD = 3.0
 """Factor between the innovations and those expected that deserves one."""
-COUNTED = {
-    'restarts': 'restarts {}',
-    'stuck': 'stuck {}',
-    'late inputs': '{} late inputs, which came after their sample had been used: raise '
-    'known_input_wait, or their header stamps are of another clock',
-    'samples before any input': '{} samples before any input, whose stamps are all later: are the '
-    'header stamps of one clock?',
-}
-"""What is said of the input where these counters have grown."""
+TOLD = ('restarts', 'stuck', 'late inputs', 'samples before any input')
+"""Counters whose growth deserves one, beside `UNUSED`."""
 
 
 def _words(name: str) -> str:
@@ -43,17 +34,6 @@ def _words(name: str) -> str:
 
 UNUSED = ('samples lost', *map(_words, UNUSED_SAMPLES), 'rejected inputs')
 """Counters of samples that the observer has not taken."""
-
-
-class Seen(NamedTuple):
-    """What was seen of a channel since the reports before."""
-
-    news: Mapping[str, int]  # by how much each counter has grown
-    period: float  # mean time between samples in seconds, NaN if there were fewer than two
-    periods: NDArray[np.float64]
-    durations: NDArray[np.float64]  # of the steps, in seconds
-    d: NDArray[np.float64]
-    stale: bool
 
 
 class Health:
@@ -72,7 +52,7 @@ class Health:
 
     def begin(self) -> None:
         """Begin to count: what was lost before does not matter."""
-        self._channel.y.source.lost = 0
+        self._channel.y.source.numbers.lost = 0
         self._before = self._counts()
 
     def _counts(self) -> dict[str, int]:
@@ -80,7 +60,7 @@ class Health:
         counters = channel.estimator.counters
         return {
             'samples accepted': counters.accepted,
-            'samples lost': y.source.lost,
+            'samples lost': y.source.numbers.lost,
             'messages without y': y.lacking,
             'samples rejected': counters.rejected,
             **{_words(name): n for name, n in counters._asdict().items() if name != 'accepted'},
@@ -93,26 +73,23 @@ class Health:
     def reports(self, stale: bool) -> list[Report]:
         """Return the reports on the time since the last ones."""
         before, self._before = self._before, self._counts()
-        stamps, durations, d = map(np.array, (self.stamps, self.durations, self.d))
+        news = {key: count - before[key] for key, count in self._before.items()}
+        periods = np.diff(np.array(self.stamps)) * NANOSECONDS
+        period = float(np.mean(periods)) if len(periods) else nan
+        jitter = float(np.std(periods)) / period if period > 0.0 else nan
+        reports = [self._input(news, stale, period, jitter), self._observer(news, stale, period)]
         for numbers in (self.stamps, self.durations, self.d):
             del numbers[:]
-        periods = np.diff(stamps) * NANOSECONDS
-        seen = Seen(
-            {key: count - before[key] for key, count in self._before.items()},
-            float(np.mean(periods)) if len(periods) else nan,
-            periods, durations, d, stale,
-        )  # fmt: skip
-        return [self._input(seen), self._observer(seen)]
+        return reports
 
     def _report(self, task: str, values: Mapping[str, Any]) -> Report:
         return Report(f'{self._channel.name} {task}'.lstrip(), values)
 
-    def _input(self, seen: Seen) -> Report:
-        """Report on the samples."""
+    def _input(self, news: Mapping[str, int], stale: bool, period: float, jitter: float) -> Report:
+        """Report on the samples; `news` is by how much each counter has grown."""
         channel, y, limits = self._channel, self._channel.y, self._channel.values
-        source, heard, news = y.source, y.source.heard, seen.news
-        rate = 1.0 / seen.period if seen.period > 0.0 else nan
-        jitter = float(np.std(seen.periods)) * rate if len(seen.periods) else nan
+        source, heard = y.source, y.source.heard
+        rate = 1.0 / period if period > 0.0 else nan
         delay = source.delay * NANOSECONDS if source.delay > -inf else nan
         offset = source.offset * NANOSECONDS if y.stamps == 'header' else 0.0
         age = perf_counter() - self.latest
@@ -121,61 +98,48 @@ class Health:
             'type': source.message_type or 'not known yet',
             'field': y.field.text if y.field else 'not known yet',
             'stamps': 'clock' if limits['sampling'] == 'clock' else y.stamps or 'not known yet',
-            'publishers': ', '.join(sorted(heard.values())) or 'none',
+            'publishers': ', '.join(sorted(heard)) or 'none',
             'sample rate [Hz]': rate,
             'jitter (std / mean of the period)': jitter,
-            'longest period [s]': float(np.max(seen.periods)) if len(seen.periods) else nan,
             'longest delay [s]': delay,
             'from stamp to publication [s]': offset,
-            'age of the last sample [s]': age,
             **self._before,
         })  # fmt: skip
         report.find(ERROR, y.error, y.error)
-        for text in source.unheard.values():
+        for text in source.unheard:
             report.find(WARN if heard else ERROR, text)
         silence = ERROR if y.error or (source.unheard and not heard) else STALE
         since = f'for {age:.3g} s' if age == age else 'yet'
-        report.find(silence, f'no usable sample {since}', seen.stale)
+        report.find(silence, f'no usable sample {since}', stale)
         alone = f'no publisher of {source.topic} that can be heard'
         report.find(silence, alone, not heard and not y.error)
         used, lacking = news['samples accepted'], news['messages without y']
-        several = f'{len(heard)} publishers, their samples mix'
+        several = f'{len(heard)} publishers, their samples mix: {", ".join(sorted(heard))}'
         report.find(WARN, several, len(heard) > 1 and not lacking)
         report.find(WARN, f'{lacking} messages without y: {y.why}', lacking and not used)
-        bad = {key: news[key] for key in UNUSED if news[key]}
-        many = sum(bad.values()) > BAD_SHARE * (sum(bad.values()) + used)
-        report.find(
-            ERROR if many else WARN, ', '.join(f'{key} {n}' for key, n in bad.items()), bad
-        )
+        bad = sum(news[key] for key in UNUSED)
+        for key in (*UNUSED, *TOLD):
+            many = key in UNUSED and bad > BAD_SHARE * (bad + used)
+            report.find(ERROR if many else WARN, f'{key} {news[key]}', news[key])
         spread = news['spread stamps']
-        report.find(
-            WARN,
-            f'/clock ticks once for {used / max(1, used - spread):.0f} samples, which makes their '
-            "times inexact: let it tick with each, or do not use sampling 'clock'",
-            used < 2 * spread,
-        )
+        ticks = f'/clock ticks once for {used / max(1, used - spread):.0f} samples'
+        report.find(WARN, ticks, used < 2 * spread)
         report.find(WARN, f'sample rate {rate:.4g} Hz', rate < limits['warn_rate_below'])
         report.find(WARN, f'jitter {jitter:.3g}', jitter > limits['warn_jitter_above'])
         latest = limits['warn_delay_above']
         report.find(WARN, f'samples arrive {delay:.3g} s after their stamps', delay > latest)
         side = 'before' if offset > 0.0 else 'after'
-        report.find(
-            WARN,
-            f'header stamps lie {abs(offset):.3g} s {side} publication: another clock than the '
-            "host's, or an old measurement; dt is not affected",
-            not channel.simulated and abs(offset) > latest,
-        )
+        apart = f'header stamps lie {abs(offset):.3g} s {side} publication'
+        report.find(WARN, apart, not channel.simulated and abs(offset) > latest)
         for name, u in channel.u.items():
             report.find(ERROR, u.error, u.error)
-            for text in u.source.unheard.values():
+            for text in u.source.unheard:
                 report.find(WARN, text)
             nobody = not u.source.heard and not u.source.unheard
             report.find(WARN, f'no publisher of {name}', nobody)
-        for key, text in COUNTED.items():
-            report.find(WARN, text.format(news[key]), news[key])
         return report
 
-    def _observer(self, seen: Seen) -> Report:
+    def _observer(self, news: Mapping[str, int], stale: bool, period: float) -> Report:
         """Report on the estimates and the steps."""
         estimator, limits = self._channel.estimator, self._channel.values
         observer, estimate, offset = estimator.observer, estimator.estimate, estimator.offset
@@ -183,20 +147,17 @@ class Health:
         gamma, d = (estimate.gamma, estimate.unknown_input) if estimate else (nan, nan)
         levels = estimate.open_levels if estimate else 0
         spread = observer.structure.memory['spread']
-        deviation = float(np.std(seen.d)) if len(seen.d) else nan
-        index = min(1.0, high_passed(seen.d, WINDOW) / deviation) if deviation > 0.0 else 0.0
-        overruns = int(np.sum(seen.durations > seen.period))
+        past, steps = np.array(self.d), np.array(self.durations)
+        deviation = float(np.std(past)) if len(past) else nan
+        index = min(1.0, high_passed(past, WINDOW) / deviation) if deviation > 0.0 else 0.0
         report = self._report('observer', {
             'open levels': f'{levels} of {observer.levels}',
             'gamma': gamma,
             'gamma is held by ~/freeze': estimator.frozen,
             'innovations over those expected': spread,
-            'y over z1, since it jumped': offset,
             titled('unknown input', unit): d,
             'chatter index (0 smooth, 1 nothing but chatter)': index,
-            'step time, mean [us]': 1e6 * float(np.sum(seen.durations)) / max(1, len(seen.d)),
-            'step time, longest [us]': 1e6 * np.max(seen.durations, initial=0.0),
-            'overruns': overruns,
+            'step time, mean [us]': 1e6 * float(np.sum(steps)) / max(1, len(steps)),
         })  # fmt: skip
         if observer.self_tuning:
             tuning, d_error = observer.tuning, float(estimator.standard_deviation[-1])
@@ -209,18 +170,10 @@ class Health:
         if limits['unknown_input_unit']:
             scaled = titled('unknown input, scaled', limits['unknown_input_unit'])
             report.values[scaled] = d * limits['unknown_input_scale']
-        event, news = estimator.events.latest, seen.news
-        if event is not None and estimator.events.on:
-            text, _ = described(event, unit)
-            if estimator.events.active and event.begins:
-                seconds = (estimator.latest - event.since) * NANOSECONDS
-                report.find(WARN, f'event: {text}; it has lasted for {seconds:.3g} s')
-            else:
-                report.find(WARN, f'{news["events"]} events, the last one {text}', news['events'])
-        report.find(STALE, 'no usable samples', seen.stale)
+        report.find(STALE, 'no usable samples', stale)
         held = f'levels from {levels + 1} on hold: an innovation is above epsilon'
         closed = estimate is not None and levels < observer.levels
-        report.find(WARN, held, closed and not seen.stale)
+        report.find(WARN, held, closed and not stale)
         diverged, jumps = news['divergences'], news['jumps']
         report.find(ERROR, f'diverged and started again from y, {diverged} times', diverged)
         report.find(WARN, f'y jumped {jumps} times', jumps)
@@ -230,10 +183,11 @@ class Health:
             moved = f'gamma is {away:+.2g} away from gamma_initial'
             report.find(WARN, moved, abs(away) > GAMMA_AWAY)
         tuned = observer.parameters['correction_period']
-        if tuned and seen.period > 0.0 and observer.configuration.levant:
-            rates = f'gains are for {1.0 / tuned:.4g} Hz, y comes at {1.0 / seen.period:.4g} Hz'
-            report.find(WARN, rates, not tuned / RATE_RATIO < seen.period < tuned * RATE_RATIO)
+        if tuned and period > 0.0 and observer.configuration.levant:
+            rates = f'gains are for {1.0 / tuned:.4g} Hz, y comes at {1.0 / period:.4g} Hz'
+            report.find(WARN, rates, not tuned / RATE_RATIO < period < tuned * RATE_RATIO)
         wide = f'innovations are {spread:.3g} times as large as noise_size says'
         report.find(WARN, wide, spread > SPREAD)
-        report.find(WARN, f'{overruns} steps took longer than the sampling period', overruns)
+        slow = int(np.sum(steps > period))
+        report.find(WARN, f'{slow} steps took longer than the sampling period', slow)
         return report

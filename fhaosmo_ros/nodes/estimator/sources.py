@@ -19,6 +19,7 @@ from fhaosmo_ros.nodes.middleware.endpoints import (
     full_name,
     OVERRIDABLE,
     SENSOR_QOS,
+    SequenceNumbers,
     subscribe_with_info,
 )
 from fhaosmo_ros.nodes.middleware.messages import definitions, message_class
@@ -27,11 +28,6 @@ from rclpy.node import Node
 from rclpy.qos import qos_check_compatible, QoSCompatibility
 
 DISCOVERY_PERIOD = 0.2
-MOST_TOLD = 3
-"""Different problems of messages that are told: a publisher may always have another one."""
-UNKNOWN = '_NODE_NAME_UNKNOWN_'
-"""The name of a node that has been discovered later than its publisher, or is none of ROS."""
-Gid = tuple[int, ...]
 Take = Callable[[int, float], None]
 """Gets the stamp of a sample in nanoseconds, and its value."""
 
@@ -61,7 +57,7 @@ class Listener:
         except ConfigurationError as error:
             self.error = str(error)
             return
-        self.field, self.stamps, self.value = field, self._wanted.stamp, field.reader()
+        self.field, self.stamps, self.value = field, self._wanted.stamp, field.value
         if self.stamps == 'auto':
             self.stamps = 'header' if field.header else 'source'
         if field.wraps:
@@ -73,29 +69,27 @@ class Source:
     """
     A topic and all that its messages are read for.
 
-    `message_type` is '' while it is not known. Of the publishers that `look` has seen, by their
-    gid, `heard` are the names of nodes that can be heard; of the others `unheard` has a sentence
-    that names the node and says what to do about it. `lost` messages did not arrive, or were
-    damaged, which the middleware drops. `delay` is the longest time from a publication to its
-    callback between the latest two looks (ns), `offset` that from the latest header's stamp to its
-    publication. `on_names` is called with the names in each message.
+    `message_type` is '' while it is not known. Of the publishers that `look` has seen, `heard` are
+    the nodes that can be heard; `unheard` has for each other one a sentence that names the node
+    and says what to do about it. `numbers.lost` messages did not arrive, or were damaged, which
+    the middleware drops. `delay` is the longest time from a publication to its callback between
+    the latest two looks (ns), `offset` that from the latest header's stamp to its publication.
+    `on_names` is called with the names in each message.
     """
 
     def __init__(self, node: Node, sources: 'Sources', topic: str) -> None:
         self._node, self._sources, self.topic = node, sources, topic
         self._logger = node.get_logger()
         self.message_type = ''
-        self.heard: dict[Gid, str] = {}
-        self.unheard: dict[Gid, str] = {}
-        self.lost = self.offset = 0
+        self.heard: list[str] = []
+        self.unheard: list[str] = []
+        self.numbers, self.offset = SequenceNumbers(), 0
         self.delay = self._delay = -math.inf
         self.on_names: Callable[[Any], None] | None = None
-        self._sequence, self._mixed = 0, False
         self.listeners: list[Listener] = []
         self._served: list[Listener] = []  # those with a field
         self._header = ''  # its name in a message
-        self._told: set[str] = set()
-        self._nameless: set[Gid] = set()
+        self._told, self._told_lacking = '', False
         self._subscription: Any = None
         self._timer: Any = None
 
@@ -123,8 +117,8 @@ class Source:
             self._node.destroy_timer(self._timer)
             self._sources.on_type()
         text = '; '.join(dict.fromkeys(li.error for li in self.listeners if li.error))
-        if text and text not in self._told:
-            self._told.add(text)
+        if text not in ('', self._told):
+            self._told = text
             self._logger.error(text)
 
     def _take_type(self, message_type: str) -> None:
@@ -143,7 +137,7 @@ class Source:
 
     def look(self) -> None:
         """
-        Look at the topic's publishers, and log what has changed.
+        Look at the topic's publishers.
 
         The middleware has an event for incompatible QoS, but it does not name the publisher, and
         there is none for another message type. The ROS graph has both.
@@ -151,26 +145,14 @@ class Source:
         if self._subscription is None:
             return
         self.delay, self._delay = self._delay, -math.inf
-        before, told = self.heard, self.unheard
-        self.heard, self.unheard = {}, {}
+        self.heard, self.unheard = [], []
         for endpoint in self._node.get_publishers_info_by_topic(self.topic):
-            gid = tuple(endpoint.endpoint_gid)
-            if endpoint.node_name == UNKNOWN and gid not in self._nameless:
-                self._nameless.add(gid)  # its node is usually known at the next look
-                continue
             name = f'{endpoint.node_namespace.rstrip("/")}/{endpoint.node_name}'
             if reason := self._mismatch(endpoint):
-                self.unheard[gid] = f'{name} publishes {self.topic} unheard: {reason}'
-                if told.get(gid) != self.unheard[gid]:
-                    self._logger.error(self.unheard[gid])
+                self.unheard.append(f'{name} publishes {self.topic} unheard: {reason}')
             else:
-                self.heard[gid] = name
-        self._mixed = len(self.heard) > 1
-        if self._mixed and self.heard.keys() != before.keys():
-            names = ' and '.join(sorted(self.heard.values()))
-            self._logger.warning(
-                f'{len(self.heard)} publishers of {self.topic}, their samples mix: {names}'
-            )
+                self.heard.append(name)
+        self.numbers.single = len(self.heard) <= 1
 
     def _mismatch(self, endpoint: Any) -> str:
         """Return why a publisher can't be heard, '' if it can."""
@@ -180,19 +162,13 @@ class Source:
         verdict, reason = qos_check_compatible(endpoint.qos_profile, own)
         if verdict != QoSCompatibility.ERROR:
             return ''
-        clashes = [part.removeprefix('ERROR: ') for part in reason.split(';') if 'ERROR' in part]
         hint = f'change qos_overrides.{self.topic}.subscription, or its own QoS'
-        return f'{", ".join(clashes).lower()}; {hint}'
+        return f'{reason.rstrip(";").lower()}; {hint}'
 
     def _on_message(self, message: Any, info: Mapping[str, Any]) -> None:
         published = info['source_timestamp']
         self._delay = max(self._delay, time_ns() - published)
-        sequence = info['publication_sequence_number'] or 0  # 0: the middleware has none
-        if 0 < sequence <= self._sequence:  # another publisher's
-            self._mixed = True  # until `look` has seen how many there are
-        elif sequence and self._sequence and not self._mixed:
-            self.lost += sequence - self._sequence - 1
-        self._sequence = sequence
+        self.numbers.take(info)
         if self.on_names is not None:
             self.on_names(getattr(message, 'name', None))
         stamps = {'source': published, 'reception': info['received_timestamp']}
@@ -200,22 +176,17 @@ class Source:
             stamp = getattr(message, self._header).stamp
             stamps['header'] = header = stamp.sec * 1_000_000_000 + stamp.nanosec
             self.offset = published - header if header else 0
-        lacking = []
         for listener in self._served:
             try:
                 value = listener.value(message)
             except MissingElementError as error:
-                lacking.append(listener)
                 listener.lacking += 1
                 listener.why = error.with_traceback(None)  # which holds the message
+                if not self._told_lacking:
+                    self._told_lacking = True
+                    self._logger.warning(f'a message on {self.topic} is left out: {error}')
             else:
                 listener.take(stamps[listener.stamps], value)
-        if lacking and len(self._told) < MOST_TOLD:
-            why = str(lacking[0].why)
-            if why not in self._told:
-                self._told.add(why)
-                more = f' (and {len(lacking) - 1} more like it)' if lacking[1:] else ''
-                self._logger.warning(f'a message on {self.topic} is left out: {why}{more}')
         self._sources.after_message()
 
 

@@ -138,6 +138,27 @@ def subscribe_with_info(
     )  # fmt: skip
 
 
+class SequenceNumbers:
+    """
+    Counts as `lost` the messages that did not arrive, by the numbers that a publisher gives them.
+
+    A number that is not above the one before is another publisher's: then there is no `single` one
+    any more, and nothing can be counted.
+    """
+
+    def __init__(self) -> None:
+        self.lost, self.single, self._before = 0, True, 0
+
+    def take(self, info: Mapping[str, Any]) -> None:
+        """Look at the number of a message."""
+        number = info['publication_sequence_number'] or 0  # 0: the middleware has none
+        if 0 < number <= self._before:
+            self.single = False
+        elif number and self._before and self.single:
+            self.lost += number - self._before - 1
+        self._before = number
+
+
 def set_period(timer: Timer, seconds: float) -> None:
     """Change a timer's period; a timer that is cancelled stays so."""
     period = round(seconds * 1e9)
