@@ -27,9 +27,11 @@ LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 """Who comes later still gets the latest messages."""
 SENSOR_QOS = QoSProfile(depth=DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
 """Best effort matches every publisher; the queue holds one second at 1 kHz."""
+MOST_KEPT = 100_000
+"""Largest depth."""
 POLICIES: dict[QoSPolicyKind, tuple[str, ...] | range] = {
     QoSPolicyKind.HISTORY: ('keep_last', 'keep_all'),
-    QoSPolicyKind.DEPTH: range(1, 100_001),
+    QoSPolicyKind.DEPTH: range(1, MOST_KEPT + 1),
     QoSPolicyKind.RELIABILITY: ('reliable', 'best_effort'),
     QoSPolicyKind.DURABILITY: ('volatile', 'transient_local'),
 }
@@ -98,16 +100,13 @@ def check_overrides(
         if not name.startswith(OVERRIDES) or name.startswith(OF_RCLPY):
             continue
         endpoint, _, policy = name.removeprefix(OVERRIDES).rpartition('.')
-        allowed = policies.get(policy)
-        if endpoint not in endpoints or allowed is None:
+        if endpoint not in endpoints or value not in policies.get(policy, ()):
             raise ConfigurationError(
                 f"parameter '{name}': expected {OVERRIDES}ENDPOINT.POLICY with ENDPOINT one of "
-                f'{", ".join(endpoints)} and POLICY one of {", ".join(policies)}'
+                f'{", ".join(endpoints)}, and depth: 1 to {MOST_KEPT}, history: keep_last or '
+                'keep_all, reliability: reliable or best_effort, durability: volatile or '
+                f'transient_local; got {value!r}'
             )
-        if value not in allowed:
-            number = f'an integer from {allowed[0]} to {allowed[-1]}'
-            expected = number if isinstance(allowed, range) else ' or '.join(allowed)
-            raise ConfigurationError(f"parameter '{name}': expected {expected}, got {value!r}")
 
 
 def subscribe_with_info(
