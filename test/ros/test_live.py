@@ -98,11 +98,6 @@ def test_live_events_are_those_of_a_replay(user, estimator):
         assert float(said['value']) == pytest.approx(event.value, rel=1e-8)
         assert int(said['since'].replace('.', '')) == event.since
     assert rig.said('event: unknown input')
-    for _ in range(100):
-        rig.send(5.0)
-    rig.wait_status('observer', WARN, 'event: unknown input', 'has lasted for')
-    rig.parameters.set(event_threshold=0.0)
-    wait_last('events are switched off')
 
 
 OWN = {'hip': {'variant': 'sign', 'lambda': [15.0]}, 'knee': {'order': 2, 'phi': ['0', '-z2']}}
@@ -221,7 +216,7 @@ def test_each_joint_is_a_channel_whatever_the_order_of_the_names(user, arm):
             name: [*e.z[:2], e.unknown_input] for name, e in expected[stamp_of(message)].items()
         }
     assert arm.said("expected a name that is in the message (elbow, wrist), got 'shoulder'")
-    assert arm.said("parameters of 'elbo' are not used", "did you mean 'elbow'")
+    assert arm.said("parameters of 'elbo' are not used")
 
 
 def test_names_that_cannot_be_are_too_many_or_come_later_are_left_out(arm):
@@ -230,7 +225,7 @@ def test_names_that_cannot_be_are_too_many_or_come_later_are_left_out(arm):
     arm.send(**bad, **many)
     assert arm.answer(**many).name == list(many)[:64]
     (line,) = arm.said('left out')
-    assert "'constants', '', 'left/wrist' can't be the name of a channel" in line
+    assert "'constants', '', 'left/wrist': no names of channels" in line
     assert len(line) < 1000
     assert "left out: 436 joints 'j64', 'j65'" in line
     assert 'beyond max_channels (64)' in line

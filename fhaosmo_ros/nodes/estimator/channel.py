@@ -6,7 +6,6 @@ from functools import partial
 from math import isfinite, isnan
 from time import perf_counter
 
-from builtin_interfaces.msg import Time
 from fhaosmo_ros.core.observer.status import AFRESH, JUMPED, REJECTED, Status, UNUSED
 from fhaosmo_ros.core.online.estimator import Change, OnlineEstimator
 from fhaosmo_ros.core.online.events import described
@@ -30,17 +29,16 @@ QUIET = 5.0
 """Seconds between two warnings of one kind."""
 TOLD = {
     Status.RESTARTED: 'the stamps jumped by more than max_gap, ahead or back: restarted from the '
-    'new one ({restarts} restarts so far); where y always comes so slowly, set max_gap to several '
-    'of its periods',
-    Status.DIVERGED: 'the observer had lost y and started again from it; its gains or its model '
-    'do not fit ({divergences} divergences so far)',
-    Status.JUMPED: 'y jumped; {jumped} ({jumps} jumps so far)',
-    Status.HELD: 'its stamp lies more than max_gap from the one before; the next one decides',
-    Status.REJECTED_PERIOD: '{late}',
-    Status.REJECTED_SPIKE: 'y = {y} is too far from its prediction',
-    Status.REJECTED_STUCK: 'y = {y} repeats itself: its sensor is stuck',
-    Status.REJECTED_MEASUREMENT: 'expected a finite y of at most 1e60, got {y}',
-    REJECTED: 'y = {y} would have made the estimate infinite',
+    'new one',
+    Status.DIVERGED: 'the observer had lost y and started again from it: its gains do not fit',
+    Status.JUMPED: 'y jumped; the other estimates go on',
+    Status.HELD: 'rejected a sample: its stamp lies more than max_gap from the one before; the '
+    'next one decides',
+    Status.REJECTED_PERIOD: 'rejected a sample: {late}',
+    Status.REJECTED_SPIKE: 'rejected a sample: y = {y} is too far from its prediction',
+    Status.REJECTED_STUCK: 'rejected a sample: y = {y} repeats itself, its sensor is stuck',
+    REJECTED: 'rejected a sample: expected a finite y of at most 1e60 that leaves the estimate '
+    'finite, got {y}',
 }
 """What is logged of a sample, by the first of these flags that it has."""
 TOLD_AFTER = 5
@@ -96,7 +94,7 @@ class Channel:
         self._arrived = False
         self._stale = True
         self._quiet_until: dict[int, float] = {}
-        self._silent_since: int | None = None
+        self._heard_at = 0  # by the node's clock
         self._waits_since = 0.0
         self._without_sample = 0
 
@@ -108,7 +106,7 @@ class Channel:
         self._health.begin()
         self._active = True
         if self.estimator.events.on:
-            self._say('no event yet')
+            self._say('no event yet', self._clock.now().nanoseconds)
         observer = self.estimator.observer
         self.logger.info(
             f'estimating {observer.order} states and the unknown input from '
@@ -121,12 +119,9 @@ class Channel:
 
     def adopt(self, values: Parameters, change: Change) -> None:
         """Go on with other live parameters, which the estimator has prepared."""
-        found = self.estimator.events.on
         self.estimator.adopt(change)
         self._outputs.snapshot(Flag.CHANGED)
         self._use(values)
-        if self._active and found != self.estimator.events.on:
-            self._say('events are switched off' if found else 'no event yet')
 
     def reports(self) -> list[Report]:
         """Return the reports for /diagnostics, on the time since the last ones."""
@@ -199,20 +194,17 @@ class Channel:
         """Publish at the node's rate, if it is to; log once that y is silent."""
         if self.pairing.by_stamp and perf_counter() - self._waits_since > self._longest_wait:
             self._take_paired(at_once=True)  # no sample follows that would release these
+        now, longest = self._clock.now().nanoseconds, self.estimator.silence
         if self._arrived:
             self._arrived = self._stale = False
-            self._silent_since = None
-        elif not self._stale:
-            now, longest = self._clock.now().nanoseconds, self.estimator.silence
-            if self._silent_since is None:  # the clock is not read while samples come
-                self._silent_since = now
-            elif not 0 <= now - self._silent_since <= longest * 1e9:  # or it jumped back
-                self._stale = True
-                self.logger.warning(
-                    f'no usable sample on {self.y.source.topic} for {longest:.3g} s: not '
-                    'publishing until one comes',
-                    throttle_duration_sec=QUIET,
-                )
+            self._heard_at = now
+        elif not self._stale and not 0 <= now - self._heard_at <= longest * 1e9:  # or back
+            self._stale = True
+            self.logger.warning(
+                f'no usable sample on {self.y.source.topic} for {longest:.3g} s: not publishing '
+                'until one comes',
+                throttle_duration_sec=QUIET,
+            )
         if not self._stale and not self._on_samples:
             self._publish()
 
@@ -222,44 +214,28 @@ class Channel:
         if now < self._quiet_until.get(flag, 0.0):
             return
         self._quiet_until[flag] = now + QUIET
-        counters, offset = self.estimator.counters, self.estimator.offset
         late = 'expected a stamp later than the one before'
-        if not stamp and self._by_clock:
-            late = 'nothing on /clock yet'
-        elif not stamp:
-            hint = '; input_stamp: source does without it' if self.y.stamps == 'header' else ''
-            late = f'its {self.y.stamps} stamp is 0: nobody fills it{hint}'
-        jumped = 'z1 follows it, the other estimates go on'
-        if offset:
-            jumped = f'the model contradicts it: y is taken as {offset:.4g} too large'
-        text = TOLD[flag].format(
-            y=y, late=late, jumped=jumped, restarts=counters.restarts, **counters._asdict()
-        )
-        if flag == Status.DIVERGED:
-            self.logger.error(text)
-        elif flag & NEWS:
-            self.logger.warning(text)
-        else:
-            self.logger.warning(f'rejected a sample: {text} ({counters.rejected} rejected so far)')
+        if not stamp and not self._by_clock:
+            late = f'its {self.y.stamps} stamp is 0: nobody fills it'
+        self.logger.warning(TOLD[flag].format(y=y, late=late))
 
     def _tell_events(self) -> None:
         """Publish, and log, the events that have begun or ended."""
         unit = derivative_unit(self.values['measurement_unit'], self.estimator.observer.order)
         for event in self.estimator.events.taken():
             text, values = described(event, unit)
-            self._say(text, time_message(event.stamp), WARN if event.begins else OK, values)
+            self._say(text, event.stamp, WARN if event.begins else OK, values)
             if event.begins:
                 self.logger.warning(f'event: {text}', throttle_duration_sec=QUIET)
 
     def _say(
-        self, text: str, stamp: Time | None = None, level: bytes = OK,
-        values: Mapping[str, str] | None = None,
-    ) -> None:  # fmt: skip
-        """Publish on the topic of events; without a stamp, with that of now."""
+        self, text: str, stamp: int, level: bytes = OK, values: Mapping[str, str] | None = None
+    ) -> None:
+        """Publish on the topic of events."""
         report = Report(f'{self.name} event'.lstrip(), values)
         report.find(level, text)
-        stamp = stamp or self._clock.now().to_msg()
-        self._events.publish(array_of(self._node, stamp, [report], self.values['hardware_id']))
+        hardware_id, time = self.values['hardware_id'], time_message(stamp)
+        self._events.publish(array_of(self._node, time, [report], hardware_id))
 
     def reset(self, _: Trigger.Request | None = None) -> str:
         """Start the observer afresh with the next sample; return what has been done."""

@@ -2,13 +2,12 @@
 """The estimator node: a managed node (ROS 2 lifecycle) of one channel or many."""
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
-from textwrap import shorten
 from typing import Any
 
 from fhaosmo_ros.core.online.estimator import Change, OnlineEstimator
-from fhaosmo_ros.core.parameters.declaration import Parameters, suggestion, Value
+from fhaosmo_ros.core.parameters.declaration import Parameters, Value
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.files import complete
 from fhaosmo_ros.core.parameters.per_channel import (
@@ -105,7 +104,8 @@ class EstimatorNode(ManagedNode):
             for topic in [*estimates_of(own[name]), EVENT]
         ]
         check_overrides(self, self._given, estimates, [wanted.topic for wanted in inputs])
-        check_axes(values['typed_outputs'], {name: own[name] for name in self._names})
+        axes = [own[name]['output_axis'] for name in self._names]
+        check_axes(values['typed_outputs'], axes)
         return estimators
 
     def configure(self) -> None:
@@ -150,19 +150,12 @@ class EstimatorNode(ManagedNode):
         self._sources.open()
 
     def _found_type(self) -> None:
-        """Choose the sampling of simulated time, once it is known which stamps there are."""
-        if not self.get_parameter('use_sim_time').value:
-            return
-        stamps = {channel.y.stamps for channel in self._channels if channel.y.stamps}
-        if self._chooses_sampling and stamps and stamps <= {'header'}:
+        """Take dt from header stamps in simulated time, once it is known that all have them."""
+        stamps = {channel.y.stamps for channel in self._channels}
+        if self._chooses_sampling and stamps == {'header'}:
             self._chooses_sampling = False
             self.get_logger().info('use_sim_time: dt comes from the header stamps')
             self.set_parameters([RosParameter('sampling', value='source_stamp')])
-        elif self._node_parameters.values['sampling'] == 'source_stamp' and 'source' in stamps:
-            self.get_logger().warning(
-                "use_sim_time with sampling = source_stamp: the middleware's stamps know nothing "
-                "of /clock, so dt is in the host's time; set sampling to clock for simulation time"
-            )
 
     def _take_joints(self, names: Any) -> None:
         """Make the channels from the first names; later, report once those that are new."""
@@ -171,22 +164,22 @@ class EstimatorNode(ManagedNode):
         present, log = self._node_parameters.values, self.get_logger()
         if self._names != FROM_JOINTS:
             self._sources.of(measured_output(present)).on_names = None
-            late = left_out([name for name in names if name not in self._joints])
-            text = f'{late} after the first message; start the node again to take it'
-            self._left_out = '; '.join(filter(None, [self._left_out, text]))
-            log.warning(text)
+            new = [name for name in names if name not in self._joints]
+            late = left_out(new, 'not in the first message')
+            self._left_out = '; '.join(filter(None, [self._left_out, late]))
+            log.warning(late)
             return
-        fit, others = self._choose(names, present['max_channels'])
-        if others not in ('', self._left_out):
-            log.error(others, throttle_duration_sec=5.0)
-        self._left_out = others
+        fit, most = self._fitting(names), present['max_channels']
+        bad = [name for name in names if name not in fit]
+        why_bad = 'no names of channels; name one and set its input_field to position[NAME]'
+        others = [left_out(bad, why_bad), left_out(fit[most:], f'beyond max_channels ({most})')]
+        self._left_out, fit = '; '.join(filter(None, others)), fit[:most]
+        if self._left_out:
+            log.error(self._left_out, throttle_duration_sec=5.0)
         if not fit:
             return
         for name in set(with_own_parameters(present[CHANNELS], present)) - set(fit):
-            log.error(
-                f"parameters of '{name}' are not used: there is no such joint"
-                f'{suggestion(name, fit)}'
-            )
+            log.error(f"parameters of '{name}' are not used: there is no such joint")
         values = complete({
             **{k: v for k, v in present.items() if (split(k)[0] or fit[0]) in fit},
             CHANNELS: fit,
@@ -203,29 +196,15 @@ class EstimatorNode(ManagedNode):
         if self.state == 'active':
             self.activate()
 
-    def _choose(self, names: Iterable[str], most: int) -> tuple[list[str], str]:
-        """Return the names that become channels, at most so many, and what is said of others."""
-        fit: list[str] = []
-        bad: dict[str, str] = {}
+    def _fitting(self, names: Iterable[str]) -> list[str]:
+        """Return the names that channels and their topics may have."""
+        fit = []
         for name in dict.fromkeys(names):
-            try:
+            with suppress(ConfigurationError):
                 channel_names({CHANNELS: [name or '?']})  # '' is no channel's name
                 full_name(self, f'~/{name}/{STANDARD_DEVIATION}')  # its longest topic
                 fit.append(name)
-            except ConfigurationError as error:
-                bad[name] = shorten(str(error), 200)
-        said = []
-        if bad:
-            said.append(
-                f"{left_out(bad)} can't be the name of a channel ({next(iter(bad.values()))}); "
-                'name a channel and set its input_field to position[NAME]'
-            )
-        if fit[most:]:
-            said.append(
-                f'{left_out(fit[most:])} beyond max_channels ({most}); raise it, or name in '
-                'channels those that are to be estimated'
-            )
-        return fit[:most], '; '.join(said)
+        return fit
 
     def activate(self) -> None:
         """Take samples and publish."""
@@ -316,10 +295,10 @@ def naming_channel(name: str) -> Iterator[None]:
         raise ConfigurationError(f"channel '{name}': {error}") from None
 
 
-def left_out(names: Collection[str]) -> str:
-    """Return in words that joints are left out."""
+def left_out(names: Collection[str], why: str) -> str:
+    """Return in words that joints are left out, '' if there are none."""
     count = 'joint' if len(names) == 1 else f'{len(names)} joints'
-    return f'left out: {count} {listed(map(repr, names))}'
+    return f'left out: {count} {listed(map(repr, names))}: {why}' if names else ''
 
 
 def main(argv: list[str] | None = None) -> int:
