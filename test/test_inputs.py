@@ -42,11 +42,11 @@ QUATERNION = made(
     (joints([]), 'position[1]', 2.0), (joints(['hip', 'elbow']), 'position[elbow]', 2.0),
     (QUATERNION, 'yaw', pytest.approx(0.8)),
     # This message's lists are too short, others' may be longer.
-    (TRAJECTORY, 'points[1].positions[0]', 'index below the number'),
-    (TRAJECTORY, 'points[0].effort[0]', 'index below the number'),
-    (joints([]), 'position[2]', '2 in one message, got 2'),
+    (TRAJECTORY, 'points[1].positions[0]', 'a longer list, got one of 1'),
+    (TRAJECTORY, 'points[0].effort[0]', 'a longer list, got one of 0'),
+    (joints([]), 'position[2]', 'a longer list, got one of 2'),
     (joints(['hip', 'elbw']), 'position[elbow]', r"\(hip, elbw\), got 'elbow'"),
-    (joints(['a', 'b', 'elbow']), 'position[elbow]', "none for 'elbow'"),
+    (joints(['a', 'b', 'elbow']), 'position[elbow]', 'a longer list, got one of 2'),
 ])  # fmt: skip
 def test_number_at_any_depth_by_index_and_by_name(message, path, expected):
     types, kind = files.TYPES, message.__msgtype__

@@ -21,7 +21,7 @@ WRONG = {
     'replay spoilt': ['whole bag', 'mcap recover'],
     'replay nameless': ['metadata.yaml', '`ros2 bag reindex`'],
     'replay empty': ["expected messages on topic '/y', got none"],
-    'replay joints -p input_field:=position[3]': ['position[3]', '3 in one message'],
+    'replay joints -p input_field:=position[3]': ['position[3]', 'a longer list, got one of 3'],
     'replay sqlite -p input_stamp:=source': ['input_stamp source: expected an mcap bag'],
     'replay bag --columns t,y': ['--columns: expected a .csv file, got'],
     # Tables.

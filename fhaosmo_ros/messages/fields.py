@@ -7,7 +7,7 @@ a rosbags typestore (``fielddefs``): by type, its constants and its fields as pa
 (kind, detail). Nodes make the same of message classes.
 """
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 import math
 from math import asin, atan2, copysign, pi
 import re
@@ -94,9 +94,14 @@ class Field(NamedTuple):
                 else:
                     node = node[step]
             except ValueError:
-                raise MissingElementError(self.text, step, names) from None
+                raise MissingElementError(
+                    f'field {self.text!r}: expected a name that is in the message '
+                    f'({listed(names) or "which has none"}), got {step.name!r}'
+                ) from None
             except IndexError:
-                raise MissingElementError(self.text, step, len(node)) from None
+                raise MissingElementError(
+                    f'field {self.text!r}: expected a longer list, got one of {len(node)}'
+                ) from None
         if self.angle:
             return angle_of(self.angle, around.x, around.y, around.z, around.w)
         return float(node[0] if isinstance(node, bytes) else node)  # a byte of rclpy
@@ -108,39 +113,14 @@ class Field(NamedTuple):
 
 
 class MissingElementError(ConfigurationError):
-    """
-    One message does not have the element of a list that is meant; others may.
-
-    Its text is made when it is asked for: messages at 1 kHz may all lack the element. `found` are
-    the names in the message or, where the list itself is too short, the number of its elements.
-    """
-
-    def __init__(self, text: str, step: int | Key, found: Sequence[str] | int) -> None:
-        super().__init__(text, step, found)
-
-    def __str__(self) -> str:
-        """Say what is meant, and what the message has instead."""
-        text, step, found = self.args
-        if isinstance(step, int):
-            problem = (
-                'expected an index below the number of elements, '
-                f'{found} in one message, got {step}'
-            )
-        elif isinstance(found, int):
-            problem = f'expected an element for each name, got none for {step.name!r}'
-        else:
-            problem = (
-                'expected a name that is in the message '
-                f'({listed(found) or "which has none"}), got {step.name!r}'
-            )
-        return f'field {text!r}: {problem}'
+    """One message does not have the element of a list that is meant; others may."""
 
 
-def listed(names: Iterable[str]) -> str:
+def listed(names: Sequence[str]) -> str:
     """Return names separated by commas, as far as one line has room for them."""
-    texts = [n if len(n) <= LONGEST_LISTED else f'{n[:LONGEST_LISTED]}...' for n in names]
-    more = len(texts) - MOST_LISTED
-    return ', '.join(texts[:MOST_LISTED]) + (f' and {more} more' if more > 0 else '')
+    first, more = names[:MOST_LISTED], len(names) - MOST_LISTED
+    texts = [n if len(n) <= LONGEST_LISTED else f'{n[:LONGEST_LISTED]}...' for n in first]
+    return ', '.join(texts) + (f' and {more} more' if more > 0 else '')
 
 
 def find_field(

@@ -4,7 +4,6 @@
 from functools import partial
 import itertools
 import math
-import re
 import time
 
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
@@ -97,7 +96,7 @@ def test_publishers_are_named(user, estimator, stranger):
     rig = estimator('/heard', **FED)
     found = rig.wait_status('input', STALE, 'no usable sample yet', 'no publisher of /heard/y')
     assert found['publishers'] == 'none'
-    rig.wait_said('still waiting', 'no publisher of /heard/y')
+    rig.wait_said('[WARN]', 'input: no usable sample yet; no publisher of /heard/y')
 
     for kind, qos, *words in (
         (Float64, BEST_EFFORT, 'best effort publisher and reliable subscription', '/y.subscrip'),
@@ -170,7 +169,6 @@ def test_bad_samples_are_rejected_and_counted_and_many_are_an_error(fed):
     assert fed.estimates[published:] == [after]  # and nothing between them
     assert all(map(math.isfinite, [*after.z, after.unknown_input, after.gamma]))
     assert abs(after.z[0] - 0.2) < 0.1
-    assert fed.said('rejected a sample: expected a finite y of at most 1e60', 'got nan')
     # Until a report has no good sample of before.
     fed.wait_status('input', ERROR, 'rejected measurements', doing=lambda: fed.send(math.nan))
 
@@ -193,8 +191,8 @@ def test_gap_stops_the_output_and_restarts_the_observer(fed):
     fed.parameters.set(max_gap=1.0, publish_on='timer')
     before = fed.count('restarts')
     fed.feed(0.2)
-    fed.wait_said('for 1 s: not publishing until one comes')
     fed.wait_status('input', STALE, 'no usable sample for')
+    fed.wait_said('input: no usable sample for')
     # The timer is silent now: over the next reports nothing comes.
     ticks = len(fed.topics['stamp'])
     for _ in range(3):
@@ -203,12 +201,11 @@ def test_gap_stops_the_output_and_restarts_the_observer(fed):
     fed.send(4.0)  # held: one stamp far away may be wrong
     assert fed.feed(4.0).z == [4.0, 0.0, 0.0]
     fed.wait_count('restarts', before + 1)
-    assert fed.said('restarted from the new one')
 
 
-def test_each_kind_of_fault_is_said_at_most_every_five_seconds(fed):
+def test_what_reports_say_is_logged_at_most_every_five_seconds(fed):
     """Each sample is a jump of the stamps, or no number."""
-    begin, said = time.monotonic(), len(fed.said('[WARN]'))
+    begin, said = time.monotonic(), len(fed.said('input: '))
     restarts, rejected = fed.count('restarts'), fed.count('rejected measurements')
     fed.parameters.set(max_gap=1e-6)
     for _ in range(20):
@@ -216,10 +213,8 @@ def test_each_kind_of_fault_is_said_at_most_every_five_seconds(fed):
         fed.send(math.nan)
     fed.wait_count('restarts', restarts + 5)
     fed.wait_count('rejected measurements', rejected + 20)
-    kinds = [re.sub(r'[-\d.e+]+', '0', line) for line in fed.said('[WARN]')[said:]]
-    most = 2 + (time.monotonic() - begin) // 5.0
-    assert max(map(kinds.count, kinds), default=0) <= most
-    assert fed.said('restarted from the new one')
+    fed.user.wait(lambda: fed.send(1.0) and fed.said('input: ', 'restarts '), 'line of the log')
+    assert len(fed.said('input: ')[said:]) <= 2 + (time.monotonic() - begin) // 5.0
 
 
 @pytest.fixture
@@ -257,7 +252,7 @@ def test_node_clock_sampling_follows_simulated_time(clock, estimator):
     at(5 * SECOND + 10 * MS, 2.0)
     estimate = rig.wait_estimate(lambda e: e.stamp < 50 * SECOND, 'estimate in the new time')
     assert estimate.z == [2.0, 0.0, 0.0]
-    assert rig.said('restarted from the new one')
+    rig.wait_count('restarts', 1)
     # /clock is slower than the samples, as `ros2 bag play --clock` makes it, at 40 Hz.
     ticks = itertools.count(6 * SECOND, 25 * MS)
 

@@ -215,7 +215,7 @@ def test_each_joint_is_a_channel_whatever_the_order_of_the_names(user, arm):
         assert {name: numbers for name, *numbers in rows} == {
             name: [*e.z[:2], e.unknown_input] for name, e in expected[stamp_of(message)].items()
         }
-    assert arm.said("expected a name that is in the message (elbow, wrist), got 'shoulder'")
+    arm.wait_count('messages without y', 8)
     assert arm.said("parameters of 'elbo' are not used")
 
 
@@ -224,6 +224,7 @@ def test_names_that_cannot_be_are_too_many_or_come_later_are_left_out(arm):
     many = {f'j{k}': 0.1 for k in range(500)}
     arm.send(**bad, **many)
     assert arm.answer(**many).name == list(many)[:64]
+    arm.wait_said('state: active; left out')
     (line,) = arm.said('left out')
     assert "'constants', '', 'left/wrist': no names of channels" in line
     assert len(line) < 1000
@@ -232,6 +233,4 @@ def test_names_that_cannot_be_are_too_many_or_come_later_are_left_out(arm):
     for k in range(300):
         arm.send(j0=0.1, **{f'late{k}_{i}': 0.1 for i in range(10)})
     arm.answer(j0=0.1)
-    assert len(arm.said("left out: 10 joints 'late0_0'")) == 1
-    assert not arm.said("joints 'late1_0'")  # said once
     arm.wait_status('state', WARN, "4 joints 'aaaa", "10 joints 'late0_0', 'late0_1'")

@@ -26,7 +26,7 @@ def test_bad_messages_are_told_counted_and_survived(user, estimator):
         other.node.create_publisher(Float64, '/bad/data', 10)
         for _ in range(2):
             rig.wait_status('input', ERROR, "field 'position[elbow]': expected a number in")
-        assert len(rig.said('expected a number in')) == 1
+        assert len(rig.said('input: ', 'expected a number in')) == 1
     data = user.publisher('/bad/data', JointState)  # of a type that has the field
     data.publish(joint_state(SECOND, ['elbow'], [0.2]))
     rig.wait_count('samples accepted', 1)
@@ -35,10 +35,8 @@ def test_bad_messages_are_told_counted_and_survived(user, estimator):
     data.publish(joint_state(SECOND + 2, ['elbow'], []))
     rig.wait_count('messages without y', 2)
     rig.wait_count('samples lost', 1)
-    assert rig.said("expected a name that is in the message (elbwo), got 'elbow'")
     data.publish(joint_state(0, ['elbow'], [0.2]))
     rig.wait_count('zero stamps', 1)
-    assert rig.said('its header stamp is 0: nobody fills it')
     data.publish(joint_state(SECOND + 10 * STEP, ['elbow'], [0.21]))
     rig.wait_count('samples accepted', 2)
     rig.wait_status('input', WARN, 'header stamps lie')
@@ -120,7 +118,6 @@ def test_known_input_of_another_topic_is_that_of_the_stamp_of_y(user, estimator,
         e = expected.update(stamp, 0.01 * k)
         user.wait(lambda k=k: len(rig.estimates) > k, 'estimate with its input')
     assert rig.estimates[-1].z == list(e.z)
-    assert rig.said('rejected u = nan: expected a finite number; the last one is held')
     y.publish(joint_state(stamps[-1], ['a'], [0.3]))  # its input never comes
     user.wait(lambda: len(rig.estimates) == len(stamps), 'end of the wait')
     send_u(stamps[-2])  # no effort: left out

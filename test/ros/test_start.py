@@ -43,7 +43,7 @@ REFUSED = [
     (P, ['fast'], ["'fast'", 'usage: plant']),
     (P, ['-p', 'order:=3'], ["'-p'", '--ros-args']),
     # Topics and messages.
-    (E, rules('input_topic:=/a b'), ["'input_topic'", "'/a b'"]),
+    (E, rules('input_topic:=/a b'), ["expected the name of a topic, got '/a b'"]),
     (E, rules('input_topic:=/a', 'input_type:=sensor_msgs/JoinState'),
      ["'input_type'", 'written as in std_msgs/msg/Float64', 'sensor_msgs/JoinState']),
     (E, rules('input_type:=nobody/msg/No'),

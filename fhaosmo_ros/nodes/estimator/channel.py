@@ -3,10 +3,10 @@
 
 from collections.abc import Mapping
 from functools import partial
-from math import isfinite, isnan
+from math import isfinite
 from time import perf_counter
 
-from fhaosmo_ros.core.observer.status import AFRESH, JUMPED, REJECTED, Status, UNUSED
+from fhaosmo_ros.core.observer.status import UNUSED
 from fhaosmo_ros.core.online.estimator import Change, OnlineEstimator
 from fhaosmo_ros.core.online.events import described
 from fhaosmo_ros.core.online.snapshots import Flag
@@ -16,33 +16,12 @@ from fhaosmo_ros.inputs import known_inputs, measured_output, Pairing
 from fhaosmo_ros.nodes.estimator.health import Health
 from fhaosmo_ros.nodes.estimator.outputs import Outputs, TypedOutputs
 from fhaosmo_ros.nodes.estimator.sources import Listener, Sources
-from fhaosmo_ros.nodes.middleware.diagnostics import array_of, OK, Report, WARN
+from fhaosmo_ros.nodes.middleware.diagnostics import array_of, OK, QUIET, Report, WARN
 from fhaosmo_ros.nodes.middleware.endpoints import create_publisher
 from fhaosmo_ros.nodes.middleware.messages import message_class, time_message
 from fhaosmo_ros.topics import DIAGNOSTICS, EVENT
 from rclpy.node import Node
 from std_srvs.srv import SetBool, Trigger
-
-NEWS = AFRESH | JUMPED
-"""Flags of a step that are logged beside those of a rejected sample."""
-QUIET = 5.0
-"""Seconds between two warnings of one kind."""
-TOLD = {
-    Status.RESTARTED: 'the stamps jumped by more than max_gap, ahead or back: restarted from the '
-    'new one',
-    Status.DIVERGED: 'the observer had lost y and started again from it: its gains do not fit',
-    Status.JUMPED: 'y jumped; the other estimates go on',
-    Status.HELD: 'rejected a sample: its stamp lies more than max_gap from the one before; the '
-    'next one decides',
-    Status.REJECTED_PERIOD: 'rejected a sample: {late}',
-    Status.REJECTED_SPIKE: 'rejected a sample: y = {y} is too far from its prediction',
-    Status.REJECTED_STUCK: 'rejected a sample: y = {y} repeats itself, its sensor is stuck',
-    REJECTED: 'rejected a sample: expected a finite y of at most 1e60 that leaves the estimate '
-    'finite, got {y}',
-}
-"""What is logged of a sample, by the first of these flags that it has."""
-TOLD_AFTER = 5
-"""Reports on /diagnostics without any sample, until the log says why there is no estimate."""
 
 
 class Channel:
@@ -78,7 +57,7 @@ class Channel:
         self.pairing = Pairing(values, observer.inputs, known, estimator.inputs)
         self.u: dict[str, Listener] = {}
         for u, its in known.items():
-            take = partial(self._on_input, observer.inputs.index(u), u)
+            take = partial(self._on_input, observer.inputs.index(u))
             self.u[u] = sources.add(its, take)
         self.y = sources.add(measured_output(values, name), self._on_sample)  # behind its inputs
         self.simulated = node.get_parameter('use_sim_time').value
@@ -93,10 +72,8 @@ class Channel:
     def _forget(self) -> None:
         self._arrived = False
         self._stale = True
-        self._quiet_until: dict[int, float] = {}
         self._heard_at = 0  # by the node's clock
         self._waits_since = 0.0
-        self._without_sample = 0
 
     def activate(self) -> None:
         """Take samples and publish from now on; the first sample starts the observer afresh."""
@@ -125,23 +102,14 @@ class Channel:
 
     def reports(self) -> list[Report]:
         """Return the reports for /diagnostics, on the time since the last ones."""
-        reports = self._health.reports(self._stale)
-        if self._active and isnan(self._health.latest):
-            self._without_sample += 1
-            # What is wrong with y itself has been logged already.
-            if self._without_sample == TOLD_AFTER and not self.y.error:
-                self.logger.warning(f'still waiting: {reports[0].text}')
-        return reports
+        return self._health.reports(self._stale)
 
-    def _on_input(self, index: int, name: str, stamp: int, u: float) -> None:
+    def _on_input(self, index: int, stamp: int, u: float) -> None:
         if self.pairing.by_stamp and isfinite(u):
             self.pairing.take_input(index, stamp, u)
             self._take_paired()
-        elif not self.estimator.set_input(u, index):
-            self.logger.warning(
-                f'rejected {name} = {u}: expected a finite number; the last one is held',
-                throttle_duration_sec=QUIET,
-            )
+        else:
+            self.estimator.set_input(u, index)
 
     def _on_sample(self, stamp: int, y: float) -> None:
         if not self._active:
@@ -168,8 +136,6 @@ class Channel:
         estimator, health, begin = self.estimator, self._health, perf_counter()
         word = estimator.advance(stamp, y)
         now = perf_counter()
-        if word & (REJECTED | NEWS):
-            self._tell(word, stamp, y)
         if estimator.events.waiting:
             self._tell_events()
         if not word & UNUSED:
@@ -191,7 +157,7 @@ class Channel:
             self._typed.add(name, (stamp, estimate, self.values))
 
     def tick(self) -> None:
-        """Publish at the node's rate, if it is to; log once that y is silent."""
+        """Publish at the node's rate, if it is to, and until y is silent."""
         if self.pairing.by_stamp and perf_counter() - self._waits_since > self._longest_wait:
             self._take_paired(at_once=True)  # no sample follows that would release these
         now, longest = self._clock.now().nanoseconds, self.estimator.silence
@@ -200,24 +166,8 @@ class Channel:
             self._heard_at = now
         elif not self._stale and not 0 <= now - self._heard_at <= longest * 1e9:  # or back
             self._stale = True
-            self.logger.warning(
-                f'no usable sample on {self.y.source.topic} for {longest:.3g} s: not publishing '
-                'until one comes',
-                throttle_duration_sec=QUIET,
-            )
         if not self._stale and not self._on_samples:
             self._publish()
-
-    def _tell(self, word: int, stamp: int, y: float) -> None:
-        """Log what became of a sample, each kind at most every `QUIET` seconds."""
-        flag, now = next(flag for flag in TOLD if word & flag), perf_counter()
-        if now < self._quiet_until.get(flag, 0.0):
-            return
-        self._quiet_until[flag] = now + QUIET
-        late = 'expected a stamp later than the one before'
-        if not stamp and not self._by_clock:
-            late = f'its {self.y.stamps} stamp is 0: nobody fills it'
-        self.logger.warning(TOLD[flag].format(y=y, late=late))
 
     def _tell_events(self) -> None:
         """Publish, and log, the events that have begun or ended."""

@@ -23,12 +23,13 @@ from fhaosmo_ros.inputs import known_inputs, measured_output, with_joints
 from fhaosmo_ros.messages.fields import listed
 from fhaosmo_ros.nodes.estimator.channel import Channel
 from fhaosmo_ros.nodes.estimator.outputs import check_axes, parameter_text, TypedOutputs
-from fhaosmo_ros.nodes.estimator.sources import check_inputs, Sources
+from fhaosmo_ros.nodes.estimator.sources import Sources
 from fhaosmo_ros.nodes.middleware.diagnostics import (
     DiagnosticsPublisher,
     ERROR,
     OK,
     Report,
+    ReportLog,
     STALE,
     WARN,
 )
@@ -97,7 +98,6 @@ class EstimatorNode(ManagedNode):
                 estimators[name] = OnlineEstimator(mine)
             known = known_inputs(mine, estimators[name].observer.used_inputs, name)
             inputs += [measured_output(mine, name), *known.values()]
-        check_inputs(self, inputs)
         estimates = [
             f'~/{name}/{topic}' if name else f'~/{topic}'
             for name in names
@@ -167,15 +167,12 @@ class EstimatorNode(ManagedNode):
             new = [name for name in names if name not in self._joints]
             late = left_out(new, 'not in the first message')
             self._left_out = '; '.join(filter(None, [self._left_out, late]))
-            log.warning(late)
             return
         fit, most = self._fitting(names), present['max_channels']
         bad = [name for name in names if name not in fit]
         why_bad = 'no names of channels; name one and set its input_field to position[NAME]'
         others = [left_out(bad, why_bad), left_out(fit[most:], f'beyond max_channels ({most})')]
         self._left_out, fit = '; '.join(filter(None, others)), fit[:most]
-        if self._left_out:
-            log.error(self._left_out, throttle_duration_sec=5.0)
         if not fit:
             return
         for name in set(with_own_parameters(present[CHANNELS], present)) - set(fit):
@@ -208,6 +205,7 @@ class EstimatorNode(ManagedNode):
 
     def activate(self) -> None:
         """Take samples and publish."""
+        self._log = ReportLog(self)
         for channel in self._channels:
             channel.activate()
         if self._channels:
@@ -278,10 +276,14 @@ class EstimatorNode(ManagedNode):
         waits = active and not self._channels
         state.find(STALE, 'no message with the names of the joints yet', waits)
         state.find(WARN, self._left_out, self._left_out)
-        if not active or waits:
-            return [state]
-        self._sources.look()
-        return [state, *(report for channel in self._channels for report in channel.reports())]
+        reports = [state]
+        if active and not waits:
+            self._sources.look()
+            reports += [report for channel in self._channels for report in channel.reports()]
+        if active:  # that y is silent is said of the input
+            silent = (STALE, 'no usable samples')
+            self._log.tell(r for r in reports if (r.level, r.text) != silent)
+        return reports
 
 
 @contextmanager
@@ -298,7 +300,7 @@ def naming_channel(name: str) -> Iterator[None]:
 def left_out(names: Collection[str], why: str) -> str:
     """Return in words that joints are left out, '' if there are none."""
     count = 'joint' if len(names) == 1 else f'{len(names)} joints'
-    return f'left out: {count} {listed(map(repr, names))}: {why}' if names else ''
+    return f'left out: {count} {listed(list(map(repr, names)))}: {why}' if names else ''
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -6,7 +6,7 @@ The type of a topic is given, or found from the graph: then the subscription beg
 publishes a type that has a wanted field.
 """
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from copy import copy
 import math
 from time import time_ns
@@ -16,7 +16,6 @@ from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.inputs import Input
 from fhaosmo_ros.messages.fields import Field, find_field, MissingElementError, Unwrapper
 from fhaosmo_ros.nodes.middleware.endpoints import (
-    full_name,
     OVERRIDABLE,
     SENSOR_QOS,
     SequenceNumbers,
@@ -47,17 +46,23 @@ class Listener:
         self.value: Callable[[Any], float]
         self.stamps = self.error = ''
         self.lacking = 0
-        self.why: MissingElementError | None = None
+        self.why = ''
 
     def find(self, types: Mapping[str, Any], message_type: str) -> None:
         """Find its field in a message type, or keep the reason as `error`."""
-        self.error, self.field = '', None
+        wanted, self.error, self.field = self._wanted, '', None
         try:
-            field = find_wanted(types, self._wanted._replace(message_type=message_type))
+            field = find_field(types, message_type, wanted.field, wanted.name)
         except ConfigurationError as error:
             self.error = str(error)
             return
-        self.field, self.stamps, self.value = field, self._wanted.stamp, field.value
+        if wanted.stamp == 'header' and not field.header:
+            self.error = (
+                "parameters 'input_stamp', 'known_input_stamps': expected messages with a header "
+                f'on {wanted.topic} for the stamps header, got {message_type}'
+            )
+            return
+        self.field, self.stamps, self.value = field, wanted.stamp, field.value
         if self.stamps == 'auto':
             self.stamps = 'header' if field.header else 'source'
         if field.wraps:
@@ -79,7 +84,6 @@ class Source:
 
     def __init__(self, node: Node, sources: 'Sources', topic: str) -> None:
         self._node, self._sources, self.topic = node, sources, topic
-        self._logger = node.get_logger()
         self.message_type = ''
         self.heard: list[str] = []
         self.unheard: list[str] = []
@@ -88,15 +92,23 @@ class Source:
         self.on_names: Callable[[Any], None] | None = None
         self.listeners: list[Listener] = []
         self._served: list[Listener] = []  # those with a field
-        self._header = ''  # its name in a message
-        self._told, self._told_lacking = '', False
+        self._header: Field | None = None  # one of a message with a header
         self._subscription: Any = None
         self._timer: Any = None
 
     def open(self) -> None:
-        """Subscribe, now or once the type of the topic is known."""
+        """
+        Subscribe, now or once the type of the topic is known.
+
+        Raises ConfigurationError if the given type is not installed, or has no such field.
+        """
         if self.message_type:
-            self._take_type(self.message_type)
+            try:
+                self._take_type(self.message_type)
+            except LookupError as error:
+                raise ConfigurationError(f"parameter 'input_type': {error}") from None
+            if error := next((li.error for li in self.listeners if li.error), ''):
+                raise ConfigurationError(error)
         elif self._timer is None:
             self._timer = self._node.create_timer(
                 DISCOVERY_PERIOD, self._discover, clock=Clock(clock_type=ClockType.STEADY_TIME)
@@ -104,7 +116,7 @@ class Source:
             self._discover()
 
     def _discover(self) -> None:
-        """Take the type of the topic's publishers; say once why if that is not possible."""
+        """Take the type of the topic's publishers, or keep why that is not possible."""
         found = self._node.get_publishers_info_by_topic(self.topic)
         if not found:
             return
@@ -116,10 +128,6 @@ class Source:
         if self._subscription:
             self._node.destroy_timer(self._timer)
             self._sources.on_type()
-        text = '; '.join(dict.fromkeys(li.error for li in self.listeners if li.error))
-        if text not in ('', self._told):
-            self._told = text
-            self._logger.error(text)
 
     def _take_type(self, message_type: str) -> None:
         """Find the fields in a message type, and subscribe if there is one."""
@@ -127,7 +135,7 @@ class Source:
         for listener in self.listeners:
             listener.find(types, message_type)
         self._served = [listener for listener in self.listeners if listener.field]
-        self._header = next((li.field.header for li in self.listeners if li.field), '')
+        self._header = next((li.field for li in self._served if li.field.header), None)
         if self._subscription is None and (self._served or self.on_names):
             self.message_type = message_type
             self._subscription = subscribe_with_info(
@@ -173,18 +181,14 @@ class Source:
             self.on_names(getattr(message, 'name', None))
         stamps = {'source': published, 'reception': info['received_timestamp']}
         if self._header:
-            stamp = getattr(message, self._header).stamp
-            stamps['header'] = header = stamp.sec * 1_000_000_000 + stamp.nanosec
+            stamps['header'] = header = self._header.stamp(message)
             self.offset = published - header if header else 0
         for listener in self._served:
             try:
                 value = listener.value(message)
             except MissingElementError as error:
                 listener.lacking += 1
-                listener.why = error.with_traceback(None)  # which holds the message
-                if not self._told_lacking:
-                    self._told_lacking = True
-                    self._logger.warning(f'a message on {self.topic} is left out: {error}')
+                listener.why = str(error)
             else:
                 listener.take(stamps[listener.stamps], value)
         self._sources.after_message()
@@ -235,25 +239,3 @@ class Sources:
         """Look at the publishers of all topics."""
         for source in self._by_topic.values():
             source.look()
-
-
-def find_wanted(types: Mapping[str, Any], wanted: Input) -> Field:
-    """Return the field of an input in its message type, or raise ConfigurationError."""
-    field = find_field(types, wanted.message_type, wanted.field, wanted.name)
-    if wanted.stamp == 'header' and not field.header:
-        raise ConfigurationError(
-            "parameters 'input_stamp', 'known_input_stamps': expected messages with a header on "
-            f'{wanted.topic} for the stamps header, got {wanted.message_type}'
-        )
-    return field
-
-
-def check_inputs(node: Node, inputs: Iterable[Input]) -> None:
-    """Raise ConfigurationError for names, types or fields that cannot be, as far as given."""
-    for wanted in inputs:
-        full_name(node, wanted.topic, "parameters 'input_topic', 'known_input_topics': ")
-        if wanted.message_type:
-            try:
-                find_wanted(definitions(wanted.message_type), wanted)
-            except LookupError as error:
-                raise ConfigurationError(f"parameter 'input_type': {error}") from None

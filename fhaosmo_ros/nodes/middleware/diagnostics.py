@@ -8,6 +8,8 @@ they still come when /clock stops.
 """
 
 from collections.abc import Callable, Iterable, Mapping
+import re
+from time import monotonic
 from typing import Any
 
 from builtin_interfaces.msg import Time
@@ -18,6 +20,8 @@ from rclpy.node import Node
 
 OK, WARN = DiagnosticStatus.OK, DiagnosticStatus.WARN
 ERROR, STALE = DiagnosticStatus.ERROR, DiagnosticStatus.STALE
+QUIET, BEGIN = 5.0, 5.0
+"""Seconds."""
 
 
 class Report:
@@ -56,6 +60,34 @@ def array_of(
             hardware_id=hardware_id, values=values,
         ))  # fmt: skip
     return message
+
+
+class ReportLog:
+    """
+    Logs reports that are not OK, each once it says something new, at most every `QUIET` seconds.
+
+    In the first `BEGIN` seconds these are errors only: publishers and subscriptions need some time
+    to find each other.
+    """
+
+    def __init__(self, node: Node) -> None:
+        self._logger = node.get_logger()
+        self._begun = monotonic() + BEGIN
+        self._said: dict[str, tuple[str, float]] = {}  # by task: what, and when to be quiet until
+
+    def tell(self, reports: Iterable[Report]) -> None:
+        """Log those of the present reports that are to be."""
+        now = monotonic()
+        for report in reports:
+            said, quiet = self._said.get(report.task, ('', 0.0))
+            kind = re.sub(r'[-+.\d]+', '', report.text)  # numbers are others each time
+            begin = 0.0 if report.level == ERROR else self._begun
+            if report.level == OK:
+                said = ''
+            elif kind != said and now > max(quiet, begin):
+                self._logger.warning(f'{report.task}: {report.text}')
+                said, quiet = kind, now + QUIET
+            self._said[report.task] = said, quiet
 
 
 class DiagnosticsPublisher:
