@@ -320,11 +320,3 @@ NODE_TABLES = {
     'plant': PLANT_NODE_PARAMETERS,
     'arm': ARM_NODE_PARAMETERS,
 }
-FIRST = (
-    'order', 'phi', 'inputs', 'structure', 'variant', 'scheme', 'lambda', 'alpha', 'epsilon',
-    'fuzzy_widths', 'unknown_input_decay', 'sampling', 'max_gap', 'input_topic', 'input_field',
-    'channels', 'publish_on', 'publish_rate', 'disturbance', 'noise_std', 'sample_rate',
-    'robot_description_file', 'measurement', 'effort', 'calibration_file', 'payload',
-    'wrench_frame',
-)  # fmt: skip
-"""The parameters that matter first, of all nodes."""

@@ -2,25 +2,22 @@
 """The command line of a node: its parameters, read once and by us, and its help."""
 
 import argparse
-from collections.abc import Iterable, Iterator
 from itertools import pairwise
 import os
 import re
 import textwrap
 from typing import Any
 
-from fhaosmo_ros import __version__
-from fhaosmo_ros.core.parameters.declaration import Parameter, shown, unknown_parameter
+from fhaosmo_ros.core.parameters.declaration import shown, unknown_parameter
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.files import check_one_type, is_built_in, read
-from fhaosmo_ros.core.parameters.tables import FIRST, NODE_TABLES
+from fhaosmo_ros.core.parameters.tables import NODE_TABLES
 from fhaosmo_ros.core.parameters.yaml_text import parse
 from rclpy.logging import get_logger
 from rclpy.utilities import remove_ros_args
 
 USAGE = '[--ros-args [--params-file FILE] [-p NAME:=VALUE] [-r FROM:=TO] ...]'
-
-
+INDENT = ' ' * 4
 Origins = dict[str, str | None]
 """By the name of a parameter: the file that sets it, None for the command line."""
 
@@ -86,22 +83,12 @@ def _full_name(name: str, arguments: list[str]) -> str:
     return f'{parts["ns"].rstrip("/")}/{parts["node"]}'
 
 
-def help_of(name: str, argv: list[str]) -> str:
-    """Return the help that a command line asks for, '' if it asks for none."""
+def help_of(name: str) -> str:
+    """Return the help of a node: all parameters, with their defaults and what is allowed."""
+    lines = [f'usage: {name} {USAGE}', '', 'Parameters and their defaults:', '']
     table = NODE_TABLES[name]
-    if '-h' in argv or '--help' in argv:
-        first = [p for p in table.values() if p.name in FIRST]
-        return '\n'.join([
-            f'usage: {name} {USAGE}', '',
-            'The parameters that matter first, and their defaults:', '', *_lines(first), '',
-            'docs/parameters.md has all of them, and so has ros2 param describe.',
-        ])  # fmt: skip
-    return f'fhaosmo_ros {__version__}' if '--version' in argv else ''
-
-
-def _lines(parameters: Iterable[Parameter]) -> Iterator[str]:
-    for p in parameters:
-        yield f'{p.name}: {shown(p.default)}'
-        indent = ' ' * 4
+    for p in [*table.values(), *table.families]:
+        lines.append(f'{p.name}: {shown(p.default)}')
         text = f'{p.text} ({p.allowed})'
-        yield from textwrap.wrap(text, 99, initial_indent=indent, subsequent_indent=indent)
+        lines += textwrap.wrap(text, 99, initial_indent=INDENT, subsequent_indent=INDENT)
+    return '\n'.join(lines)

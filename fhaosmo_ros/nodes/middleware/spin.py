@@ -117,8 +117,8 @@ def run_node(name: str, factory: Callable[..., Node], argv: list[str] | None) ->
     and a second Ctrl-C would cut the clean-up short.
     """
     argv = sys.argv[1:] if argv is None else argv
-    if text := help_of(name, argv):
-        print(text)
+    if '-h' in argv or '--help' in argv:
+        print(help_of(name))
         return 0
     ended = stop_on_signals()
     node = None
