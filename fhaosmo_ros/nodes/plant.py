@@ -42,7 +42,6 @@ class PlantNode(TimedNode):
         self._u = [0.0] * len(self.plant.model.inputs)
         self._origin: int | None = None
         self._now = 0
-        self._diverged = False
         self._state_message = labelled([f'z{i + 1}' for i in range(self.plant.order)])
         check_overrides(self, given, TOPICS)
         self._publish_y, self._publish_state, self._publish_d = (
@@ -71,13 +70,12 @@ class PlantNode(TimedNode):
         clock = self.get_clock()
         self.plant.advance(self._plant_time(clock.now().nanoseconds), self._u)
         if not np.isfinite(self.plant.states).all():
-            if not self._diverged:
-                self._diverged = True
-                self.get_logger().error(
-                    'the simulated plant has left the finite numbers: nothing is published any '
-                    'more; its phi, the disturbance or a known input make it unstable. Correct '
-                    'them and start the node again'
-                )
+            self.get_logger().error(
+                'the simulated plant has left the finite numbers: nothing is published any more; '
+                'its phi, the disturbance or a known input make it unstable. Correct them and '
+                'start the node again',
+                once=True,
+            )
             return
         now = self._plant_time(clock.now().nanoseconds)
         y = self.plant.measure(now)

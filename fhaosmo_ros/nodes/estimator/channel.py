@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """One channel of an estimator node: y (and u) in, one observer, estimates out."""
 
-from collections.abc import Mapping
 from functools import partial
 from math import isfinite
 from time import perf_counter
@@ -82,8 +81,6 @@ class Channel:
         self.pairing.forget_samples()
         self._health.begin()
         self._active = True
-        if self.estimator.events.on:
-            self._say('no event yet', self._clock.now().nanoseconds)
         observer = self.estimator.observer
         self.logger.info(
             f'estimating {observer.order} states and the unknown input from '
@@ -160,11 +157,11 @@ class Channel:
         """Publish at the node's rate, if it is to, and until y is silent."""
         if self.pairing.by_stamp and perf_counter() - self._waits_since > self._longest_wait:
             self._take_paired(at_once=True)  # no sample follows that would release these
-        now, longest = self._clock.now().nanoseconds, self.estimator.silence
+        now = self._clock.now().nanoseconds
         if self._arrived:
             self._arrived = self._stale = False
             self._heard_at = now
-        elif not self._stale and not 0 <= now - self._heard_at <= longest * 1e9:  # or back
+        elif not 0 <= now - self._heard_at <= self.estimator.silence * 1e9:  # or it jumped back
             self._stale = True
         if not self._stale and not self._on_samples:
             self._publish()
@@ -174,18 +171,12 @@ class Channel:
         unit = derivative_unit(self.values['measurement_unit'], self.estimator.observer.order)
         for event in self.estimator.events.taken():
             text, values = described(event, unit)
-            self._say(text, event.stamp, WARN if event.begins else OK, values)
+            report = Report(f'{self.name} event'.lstrip(), values)
+            report.find(WARN if event.begins else OK, text)
+            hardware_id, time = self.values['hardware_id'], time_message(event.stamp)
+            self._events.publish(array_of(self._node, time, [report], hardware_id))
             if event.begins:
                 self.logger.warning(f'event: {text}', throttle_duration_sec=QUIET)
-
-    def _say(
-        self, text: str, stamp: int, level: bytes = OK, values: Mapping[str, str] | None = None
-    ) -> None:
-        """Publish on the topic of events."""
-        report = Report(f'{self.name} event'.lstrip(), values)
-        report.find(level, text)
-        hardware_id, time = self.values['hardware_id'], time_message(stamp)
-        self._events.publish(array_of(self._node, time, [report], hardware_id))
 
     def reset(self, _: Trigger.Request | None = None) -> str:
         """Start the observer afresh with the next sample; return what has been done."""

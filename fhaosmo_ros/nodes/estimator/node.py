@@ -168,11 +168,13 @@ class EstimatorNode(ManagedNode):
             late = left_out(new, 'not in the first message')
             self._left_out = '; '.join(filter(None, [self._left_out, late]))
             return
-        fit, most = self._fitting(names), present['max_channels']
-        bad = [name for name in names if name not in fit]
-        why_bad = 'no names of channels; name one and set its input_field to position[NAME]'
-        others = [left_out(bad, why_bad), left_out(fit[most:], f'beyond max_channels ({most})')]
-        self._left_out, fit = '; '.join(filter(None, others)), fit[:most]
+        most = present['max_channels']
+        fit = self._fitting(names)[:most]
+        self._left_out = left_out(
+            [name for name in names if name not in fit],
+            f'beyond max_channels ({most}), or not allowed as the name of a channel: name one, '
+            'and set its input_field to position[NAME]',
+        )
         if not fit:
             return
         for name in set(with_own_parameters(present[CHANNELS], present)) - set(fit):

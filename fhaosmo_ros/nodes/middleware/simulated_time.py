@@ -11,12 +11,10 @@ from rosgraph_msgs.msg import Clock
 
 class TimedNode(Node):
     """
-    A node that ignores messages on /clock with negative seconds, and logs how many there were.
+    A node that ignores messages on /clock with negative seconds, and logs them.
 
     In rclpy 7.1 they raise ValueError in its subscription of /clock, which ends the node.
     """
-
-    _rejected = 0
 
     def create_subscription(
         self, msg_type: Any, topic: str, callback: Any, *arguments: Any, **options: Any
@@ -30,9 +28,7 @@ class TimedNode(Node):
         if message.clock.sec >= 0:
             take(message)
             return
-        self._rejected += 1
         self.get_logger().warning(
-            f'rejected a time on /clock: expected seconds >= 0, got {message.clock.sec} '
-            f'({self._rejected} rejected so far)',
+            f'rejected a time on /clock: expected seconds >= 0, got {message.clock.sec}',
             throttle_duration_sec=5.0,
         )
