@@ -22,7 +22,7 @@ from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
 from fhaosmo_ros.inputs import known_inputs, measured_output, with_joints
 from fhaosmo_ros.messages.fields import listed
 from fhaosmo_ros.nodes.estimator.channel import Channel
-from fhaosmo_ros.nodes.estimator.outputs import check_axes, parameter_text, TypedOutputs
+from fhaosmo_ros.nodes.estimator.outputs import parameter_text, TypedOutputs
 from fhaosmo_ros.nodes.estimator.sources import Sources
 from fhaosmo_ros.nodes.middleware.diagnostics import (
     DiagnosticsPublisher,
@@ -105,7 +105,11 @@ class EstimatorNode(ManagedNode):
         ]
         check_overrides(self, self._given, estimates, [wanted.topic for wanted in inputs])
         axes = [own[name]['output_axis'] for name in self._names]
-        check_axes(values['typed_outputs'], axes)
+        if {'wrench', 'accel'} & set(values['typed_outputs']) and len(set(axes)) < len(axes):
+            raise ConfigurationError(
+                "parameter 'output_axis': expected another axis for each channel, got "
+                f'{", ".join(axes)}'
+            )
         return estimators
 
     def configure(self) -> None:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What channels publish, alone and together, and the text with the parameters of their node."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from math import nan
 from time import perf_counter
 from typing import Any
@@ -12,7 +12,6 @@ from fhaosmo_ros.core.observer.estimates import Estimate, TUNING
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.online.snapshots import Flag, pack, Snapshot
 from fhaosmo_ros.core.parameters.declaration import Parameters
-from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.files import dumps
 from fhaosmo_ros.core.parameters.per_channel import CHANNELS, differing, of_channel
 from fhaosmo_ros.inputs import Input, known_inputs, measured_output
@@ -150,15 +149,6 @@ def _on_axes(name: str, outputs: Mapping[str, Output]) -> Any:
             d = _effort(estimate, values)
         setattr(getattr(getattr(message, name), vector), axis, d)
     return message
-
-
-def check_axes(typed_outputs: Sequence[str], axes: Sequence[str]) -> None:
-    """Raise ConfigurationError if two channels would write to the same axis of a message."""
-    if {'wrench', 'accel'} & set(typed_outputs) and len(set(axes)) < len(axes):
-        raise ConfigurationError(
-            "parameter 'output_axis': expected another axis for each channel, got "
-            f'{", ".join(axes)}'
-        )
 
 
 def parameter_text(node: Node, values: Parameters) -> str:

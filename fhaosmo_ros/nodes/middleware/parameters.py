@@ -41,7 +41,6 @@ def descriptor(parameter: Parameter, read_only: bool) -> ParameterDescriptor:
     constraints = (
         parameter.allowed,
         parameter.lengths,
-        'logarithmic scale: change it by a factor' if parameter.logarithmic else '',
         'fixed while the node is configured: set it after cleanup' if fixed else '',
     )
     result = ParameterDescriptor(

@@ -141,11 +141,11 @@ def run_node(name: str, factory: Callable[..., Node], argv: list[str] | None) ->
             return 1
     except Stopped:
         pass
-    except ConfigurationError as error:
-        return _refused(name, str(with_origin(error, origins)))
-    except RuntimeError as error:  # rcl's
+    except (ConfigurationError, RuntimeError) as error:  # the latter is rcl's
+        text = of_rcl(with_origin(error, origins))
         unknown = 'unknown ROS arguments ' * (type(error).__name__ == 'UnknownROSArgsError')
-        return _refused(name, unknown + of_rcl(error))
+        print(f'{name}: error: {unknown}{" ".join(text.split())}', file=sys.stderr)
+        return 2
     finally:
         if node is not None:
             node.destroy_node()
@@ -158,9 +158,3 @@ def of_rcl(error: Exception) -> str:
     """Return what rcl says, without its places in C, and what to do where it has no folder."""
     text = re.sub(r', at \S+:\d+', '', str(error))
     return text + '; set HOME or ROS_LOG_DIR' * ('logging directory' in text)
-
-
-def _refused(name: str, text: str) -> int:
-    """Say in one line what is wrong, and return the exit code."""
-    print(f'{name}: error: {" ".join(text.split())}', file=sys.stderr)
-    return 2
