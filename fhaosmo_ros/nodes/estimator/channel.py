@@ -4,6 +4,7 @@
 from functools import partial
 from math import isfinite
 from time import perf_counter
+from typing import Any
 
 from fhaosmo_ros.core.observer.status import UNUSED
 from fhaosmo_ros.core.online.estimator import Change, OnlineEstimator
@@ -13,13 +14,12 @@ from fhaosmo_ros.core.parameters.declaration import Parameters
 from fhaosmo_ros.core.parameters.units import derivative_unit
 from fhaosmo_ros.inputs import known_inputs, measured_output, Pairing
 from fhaosmo_ros.nodes.estimator.health import Health
-from fhaosmo_ros.nodes.estimator.outputs import Outputs, TypedOutputs
-from fhaosmo_ros.nodes.estimator.sources import Listener, Sources
+from fhaosmo_ros.nodes.estimator.outputs import Outputs
+from fhaosmo_ros.nodes.estimator.sources import Listener
 from fhaosmo_ros.nodes.middleware.diagnostics import array_of, OK, QUIET, Report, WARN
 from fhaosmo_ros.nodes.middleware.endpoints import create_publisher
 from fhaosmo_ros.nodes.middleware.messages import message_class, time_message
 from fhaosmo_ros.topics import DIAGNOSTICS, EVENT
-from rclpy.node import Node
 from std_srvs.srv import SetBool, Trigger
 
 
@@ -28,19 +28,14 @@ class Channel:
     Takes y and the known inputs out of messages, steps the observer, publishes the estimates.
 
     A new channel is inactive: its topics and services exist, but samples are dropped and nothing
-    is published. `name` is in its topics, services, reports and log, '' without names.
+    is published. `name` is in its topics, services, reports and log, '' without names. The `node`
+    has the `sources` and the `typed` outputs that its channels share.
     """
 
     def __init__(
-        self,
-        node: Node,
-        values: Parameters,
-        estimator: OnlineEstimator,
-        sources: Sources,
-        typed: TypedOutputs,
-        name: str = '',
+        self, node: Any, values: Parameters, estimator: OnlineEstimator, name: str = ''
     ) -> None:
-        self._node, self._typed, self.name = node, typed, name
+        self._node, self.name = node, name
         self._clock = node.get_clock()
         self.logger = node.get_logger().get_child(name) if name else node.get_logger()
         self.estimator, observer = estimator, estimator.observer
@@ -57,8 +52,8 @@ class Channel:
         self.u: dict[str, Listener] = {}
         for u, its in known.items():
             take = partial(self._on_input, observer.inputs.index(u))
-            self.u[u] = sources.add(its, take)
-        self.y = sources.add(measured_output(values, name), self._on_sample)  # behind its inputs
+            self.u[u] = node.sources.add(its, take)
+        self.y = node.sources.add(measured_output(values, name), self._on_sample)  # after u
         self.simulated = node.get_parameter('use_sim_time').value
         self._health = Health(self)
 
@@ -151,7 +146,7 @@ class Channel:
         if estimate is not None:
             self._outputs.publish(estimate, stamp)
             name = self.name or (self.y.field and self.y.field.key) or 'y'
-            self._typed.add(name, (stamp, estimate, self.values))
+            self._node.typed.add(name, (stamp, estimate, self.values))
 
     def tick(self) -> None:
         """Publish at the node's rate, if it is to, and until y is silent."""

@@ -116,12 +116,12 @@ class EstimatorNode(ManagedNode):
         """Make the channel, or channels, from the present parameters."""
         values = self._node_parameters.values
         estimators = self._make_estimators()
-        self._sources = Sources(self, self._found_type)
+        self.sources = Sources(self, self._found_type)
         latest = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self._parameters_topic = self.create_publisher(String, f'~/{PARAMETERS}', latest)
         if self._names == FROM_JOINTS:
-            self._sources.of(measured_output(values)).on_names = self._take_joints
-            self._sources.open()
+            self.sources.of(measured_output(values)).on_names = self._take_joints
+            self.sources.open()
             self.get_logger().info(
                 'channels from_joint_names: waiting for the first message on '
                 f'{self.resolve_topic_name(measured_output(values).topic)}'
@@ -140,18 +140,18 @@ class EstimatorNode(ManagedNode):
         values = self._node_parameters.values
         self._timer = self.create_timer(1.0 / values['publish_rate'], self._tick)
         self._timer.cancel()
-        self._typed = TypedOutputs(self, values)
+        self.typed = TypedOutputs(self, values)
         self._channels = [
-            Channel(self, of_channel(values, name), estimator, self._sources, self._typed, name)
+            Channel(self, of_channel(values, name), estimator, name)
             for name, estimator in estimators.items()
         ]
-        self._sources.after_message = self._typed.publish
+        self.sources.after_message = self.typed.publish
         of_prefix = {f'~/{channel.name}/': [channel] for channel in self._channels if channel.name}
         for prefix, channels in {**of_prefix, '~/': self._channels}.items():
             for kind, act in ((Trigger, Channel.reset), (SetBool, Channel.freeze)):
                 answer = partial(self._answer, channels, act)
                 self.create_service(kind, prefix + act.__name__, answer)
-        self._sources.open()
+        self.sources.open()
 
     def _found_type(self) -> None:
         """Take dt from header stamps in simulated time, once it is known that all have them."""
@@ -167,7 +167,7 @@ class EstimatorNode(ManagedNode):
             return
         present, log = self._node_parameters.values, self.get_logger()
         if self._names != FROM_JOINTS:
-            self._sources.of(measured_output(present)).on_names = None
+            self.sources.of(measured_output(present)).on_names = None
             new = [name for name in names if name not in self._joints]
             late = left_out(new, 'not in the first message')
             self._left_out = '; '.join(filter(None, [self._left_out, late]))
@@ -232,7 +232,7 @@ class EstimatorNode(ManagedNode):
     def _tick(self) -> None:
         for channel in self._channels:
             channel.tick()
-        self._typed.publish()
+        self.typed.publish()
 
     def _answer(
         self, channels: Iterable[Channel], act: Callable[..., str], request: Any, response: Any
@@ -284,7 +284,7 @@ class EstimatorNode(ManagedNode):
         state.find(WARN, self._left_out, self._left_out)
         reports = [state]
         if active and not waits:
-            self._sources.look()
+            self.sources.look()
             reports += [report for channel in self._channels for report in channel.reports()]
         if active:  # that y is silent is said of the input
             silent = (STALE, 'no usable samples')
