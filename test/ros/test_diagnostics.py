@@ -4,6 +4,7 @@
 from functools import partial
 import itertools
 import math
+import re
 import time
 
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
@@ -203,7 +204,7 @@ def test_gap_stops_the_output_and_restarts_the_observer(fed):
     fed.wait_count('restarts', before + 1)
 
 
-def test_what_reports_say_is_logged_at_most_every_five_seconds(fed):
+def test_a_thing_that_reports_say_is_logged_at_most_every_five_seconds(fed):
     """Each sample is a jump of the stamps, or no number."""
     begin, said = time.monotonic(), len(fed.said('input: '))
     restarts, rejected = fed.count('restarts'), fed.count('rejected measurements')
@@ -214,7 +215,9 @@ def test_what_reports_say_is_logged_at_most_every_five_seconds(fed):
     fed.wait_count('restarts', restarts + 5)
     fed.wait_count('rejected measurements', rejected + 20)
     fed.user.wait(lambda: fed.send(1.0) and fed.said('input: ', 'restarts '), 'line of the log')
-    assert len(fed.said('input: ')[said:]) <= 2 + (time.monotonic() - begin) // 5.0
+    lines = [line.partition('input: ')[2] for line in fed.said('input: ')[said:]]
+    kinds = [re.sub(r'[-+.\d]+', '', line) for line in lines]
+    assert max(map(kinds.count, kinds)) <= 2 + (time.monotonic() - begin) // 5.0
 
 
 @pytest.fixture

@@ -53,7 +53,7 @@ class EstimatorNode(ManagedNode):
     names of the channels.
 
     `given` are values of parameters, also of rclpy's own such as use_sim_time. Those that can't be
-    used raise ConfigurationError before anything is subscribed or published.
+    used raise ConfigurationError, unless the node waits to be configured.
     """
 
     def __init__(self, given: Mapping[str, Any] | None = None, **options: Any) -> None:

@@ -20,7 +20,6 @@ from fhaosmo_ros.nodes.middleware.messages import labelled, message_class, time_
 from fhaosmo_ros.topics import ARRAY, estimates_of, SNAPSHOT, STANDARD_DEVIATION, TYPED_ESTIMATES
 import numpy as np
 from rclpy.node import Node
-from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64
 
 PERIOD, PERIOD_OF_SELF_TUNING = 1.0, 30.0
@@ -116,39 +115,30 @@ class TypedOutputs:
         if not self._waiting:
             return
         for name, publisher in self._listeners.heard().items():
-            message = (_joint_states if name == 'joint_states' else _on_axes)(name, self._waiting)
+            message = publisher.msg_type()
+            _fill(message, name, self._waiting)
             message.header.frame_id = self._frame
             message.header.stamp = time_message(max(stamp for stamp, *_ in self._waiting.values()))
             publisher.publish(message)
         self._waiting.clear()
 
 
-def _effort(estimate: Estimate, values: Mapping[str, Any]) -> float:
-    """Return the unknown input in the user's unit."""
-    return float(estimate.unknown_input * values['unknown_input_scale'])
-
-
-def _joint_states(_: str, outputs: Mapping[str, Output]) -> JointState:
-    states = [estimate.z for _, estimate, _ in outputs.values()]
-    return JointState(
-        name=list(outputs),
-        position=[float(z[0]) for z in states],
-        velocity=[float(z[1]) if len(z) > 1 else nan for z in states],
-        effort=[_effort(estimate, values) for _, estimate, values in outputs.values()],
-    )
-
-
-def _on_axes(name: str, outputs: Mapping[str, Output]) -> Any:
-    """Return a wrench of the efforts, or an accel of the unknown inputs, on their axes."""
-    message = message_class(TYPED_ESTIMATES[name])()
-    for _, estimate, values in outputs.values():
+def _fill(message: Any, name: str, outputs: Mapping[str, Output]) -> None:
+    """Put estimates into a JointState, a wrench of efforts, or an accel of unknown inputs."""
+    for channel, (_, estimate, values) in outputs.items():
+        z, d = estimate.z, float(estimate.unknown_input)
+        effort = d * values['unknown_input_scale']
         vector, axis = values['output_axis'].split('.')
-        d = float(estimate.unknown_input)
-        if name == 'wrench':
-            vector = {'linear': 'force', 'angular': 'torque'}[vector]
-            d = _effort(estimate, values)
-        setattr(getattr(getattr(message, name), vector), axis, d)
-    return message
+        if name == 'joint_states':
+            message.name.append(channel)
+            message.position.append(z[0])
+            message.velocity.append(z[1] if len(z) > 1 else nan)
+            message.effort.append(effort)
+        elif name == 'wrench':
+            force = {'linear': message.wrench.force, 'angular': message.wrench.torque}[vector]
+            setattr(force, axis, effort)
+        else:
+            setattr(getattr(message.accel, vector), axis, d)
 
 
 def parameter_text(node: Node, values: Parameters) -> str:

@@ -64,7 +64,7 @@ def array_of(
 
 class ReportLog:
     """
-    Logs reports that are not OK, each once it says something new, at most every `QUIET` seconds.
+    Logs reports that are not OK, each once it says something new, a thing at most every `QUIET` s.
 
     In the first `BEGIN` seconds these are errors only: publishers and subscriptions need some time
     to find each other.
@@ -73,21 +73,22 @@ class ReportLog:
     def __init__(self, node: Node) -> None:
         self._logger = node.get_logger()
         self._begun = monotonic() + BEGIN
-        self._said: dict[str, tuple[str, float]] = {}  # by task: what, and when to be quiet until
+        self._latest: dict[str, str] = {}  # by task: what the report before has said
+        self._quiet: dict[str, float] = {}  # by what was said: when it may be said again
 
     def tell(self, reports: Iterable[Report]) -> None:
         """Log those of the present reports that are to be."""
         now = monotonic()
+        self._quiet = {said: end for said, end in self._quiet.items() if end > now}
         for report in reports:
-            said, quiet = self._said.get(report.task, ('', 0.0))
-            kind = re.sub(r'[-+.\d]+', '', report.text)  # numbers are others each time
-            begin = 0.0 if report.level == ERROR else self._begun
-            if report.level == OK:
-                said = ''
-            elif kind != said and now > max(quiet, begin):
-                self._logger.warning(f'{report.task}: {report.text}')
-                said, quiet = kind, now + QUIET
-            self._said[report.task] = said, quiet
+            if now < self._begun and report.level != ERROR:
+                continue
+            text = f'{report.task}: {report.text}'
+            kind = re.sub(r'[-+.\d]+', '', text)  # numbers are others each time
+            before, self._latest[report.task] = self._latest.get(report.task), kind
+            if report.level != OK and kind != before and kind not in self._quiet:
+                self._logger.warning(text)
+                self._quiet[kind] = now + QUIET
 
 
 class DiagnosticsPublisher:
