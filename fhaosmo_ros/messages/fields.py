@@ -82,26 +82,25 @@ class Field(NamedTuple):
             A list of the message is too short, or lacks the name.
 
         """
-        around, node = message, message
-        for step in self.steps:
-            if isinstance(step, str):
-                around, node = node, getattr(node, step)
-                continue
-            try:
-                if isinstance(step, Key):
+        around = node = message
+        try:
+            for step in self.steps:
+                if isinstance(step, str):
+                    around, node = node, getattr(node, step)
+                elif isinstance(step, Key):
                     names = getattr(around, step.names)
                     node = node[names.index(step.name)]
                 else:
                     node = node[step]
-            except ValueError:
-                raise MissingElementError(
-                    f'field {self.text!r}: expected a name that is in the message '
-                    f'({listed(names) or "which has none"}), got {step.name!r}'
-                ) from None
-            except IndexError:
-                raise MissingElementError(
-                    f'field {self.text!r}: expected a longer list, got one of {len(node)}'
-                ) from None
+        except ValueError:
+            raise MissingElementError(
+                f'field {self.text!r}: expected a name that is in the message '
+                f'({listed(names) or "which has none"}), got {step.name!r}'
+            ) from None
+        except IndexError:
+            raise MissingElementError(
+                f'field {self.text!r}: expected a longer list, got one of {len(node)}'
+            ) from None
         if self.angle:
             return angle_of(self.angle, around.x, around.y, around.z, around.w)
         return float(node[0] if isinstance(node, bytes) else node)  # a byte of rclpy

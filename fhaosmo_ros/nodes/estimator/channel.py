@@ -148,11 +148,10 @@ class Channel:
             name = self.name or (self.y.field and self.y.field.key) or 'y'
             self._node.typed.add(name, (stamp, estimate, self.values))
 
-    def tick(self) -> None:
-        """Publish at the node's rate, if it is to, and until y is silent."""
+    def tick(self, now: int) -> None:
+        """Publish at the node's rate, if it is to, and until y is silent by the node's clock."""
         if self.pairing.by_stamp and perf_counter() - self._waits_since > self._longest_wait:
             self._take_paired(at_once=True)  # no sample follows that would release these
-        now = self._clock.now().nanoseconds
         if self._arrived:
             self._arrived = self._stale = False
             self._heard_at = now

@@ -230,8 +230,9 @@ class EstimatorNode(ManagedNode):
         self._channels, self._parameters_topic = [], None
 
     def _tick(self) -> None:
+        now = self.get_clock().now().nanoseconds
         for channel in self._channels:
-            channel.tick()
+            channel.tick(now)
         self.typed.publish()
 
     def _answer(
