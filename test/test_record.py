@@ -200,19 +200,19 @@ def test_bag_is_played_in_its_own_time_and_an_estimator_restarts_with_the_next(t
 
 
 def test_only_installed_message_types_have_a_class(tmp_path, monkeypatch):
-    """Names in a bag come from strangers: no package that lies beside a bag is imported."""
+    """Names in a bag come from strangers: no other package that has such a name is imported."""
     assert message_class('std_msgs/msg/Float64').__name__ == 'Float64'
-    package, mark = tmp_path / 'workspace_msgs', tmp_path / 'imported'
+    site_packages = tmp_path / 'install' / 'lib' / 'python3' / 'site-packages'
+    package, mark = site_packages / 'workspace_msgs', tmp_path / 'imported'
     (package / 'msg').mkdir(parents=True)
     (package / '__init__.py').write_text(f"open({str(mark)!r}, 'w').close()\n")
     (package / 'msg' / '__init__.py').write_text('class Thing:\n    pass\n')
-    monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(site_packages)
     for name in ('workspace_msgs/msg/Thing', 'std_msgs/msg/Nothing', 'os/msg/Path', ''):
         with pytest.raises(LookupError, match='expected a message type that is installed here'):
             message_class(name)
     assert not mark.exists()
-    monkeypatch.chdir(ROOT)
+    monkeypatch.setenv('AMENT_PREFIX_PATH', f'{tmp_path / "install"}{os.pathsep}')
     assert message_class('workspace_msgs/msg/Thing').__name__ == 'Thing'
     assert mark.exists()
 

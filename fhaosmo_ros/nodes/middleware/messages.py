@@ -6,8 +6,10 @@ from collections.abc import Callable
 from contextlib import suppress
 import importlib
 from importlib.util import find_spec
+import os
 from pathlib import Path
 import re
+import site
 from typing import Any
 
 from builtin_interfaces.msg import Time
@@ -46,8 +48,10 @@ def message_class(name: str) -> Any:
     """
     Return the class of a message type, such as 'std_msgs/msg/Float64'.
 
-    Names come from bags and from the network, and importing a module runs its code. So nothing is
-    imported but packages with messages, and none from the working directory, where a bag may lie.
+    Names come from bags and from the network, and importing a module runs its code. So a package
+    is imported only from where interface packages are installed: the environment's site-packages,
+    or those of a sourced workspace (AMENT_PREFIX_PATH). One that lies in the working directory,
+    for instance beside the bag, is not.
 
     Raises
     ------
@@ -66,12 +70,17 @@ def message_class(name: str) -> Any:
 
 
 def _is_installed(package: str) -> bool:
-    """Return True for a package of messages; finding it does not run its code."""
+    """Return True for a package of messages in site-packages; finding it does not run its code."""
     spec = find_spec(package)
-    if not (spec and spec.origin):
+    if not (spec and spec.origin and Path(spec.origin).with_name('msg').is_dir()):
         return False
-    path = Path(spec.origin).resolve()
-    return path.with_name('msg').is_dir() and path.parents[1] != Path.cwd()
+    folder = Path(spec.origin).parents[1].resolve()
+    own = [Path(path).resolve() for path in (*site.getsitepackages(), site.getusersitepackages())]
+    if folder in own:
+        return True
+    prefixes = filter(None, os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep))
+    in_workspace = any(folder.is_relative_to(Path(prefix).resolve()) for prefix in prefixes)
+    return in_workspace and folder.name in ('site-packages', 'dist-packages')
 
 
 def definitions(message_type: str) -> dict[str, Any]:
