@@ -7,7 +7,7 @@ a rosbags typestore (``fielddefs``): by type, its constants and its fields as pa
 (kind, detail). Nodes make the same of message classes.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 import math
 from math import asin, atan2, copysign, pi
 import re
@@ -104,6 +104,21 @@ class Field(NamedTuple):
         if self.angle:
             return angle_of(self.angle, around.x, around.y, around.z, around.w)
         return float(node[0] if isinstance(node, bytes) else node)  # a byte of rclpy
+
+    def reader(self) -> Callable[[Any], float]:
+        """Return `value`, or the same for an element by its name in half the time."""
+        if [type(step) for step in self.steps] != [str, Key]:
+            return self.value
+        elements, (name, names), value = self.steps[0], self.steps[1], self.value
+
+        def read(message: Any) -> float:
+            try:
+                found = getattr(message, elements)[getattr(message, names).index(name)]
+            except (ValueError, IndexError):
+                return value(message)  # which says what is wrong
+            return found if isinstance(found, float) else value(message)
+
+        return read
 
     def stamp(self, message: Any) -> int:
         """Return the stamp of the header that the message begins with, in nanoseconds."""

@@ -62,7 +62,7 @@ class Listener:
                 f'on {wanted.topic} for the stamps header, got {message_type}'
             )
             return
-        self.field, self.stamps, self.value = field, wanted.stamp, field.value
+        self.field, self.stamps, self.value = field, wanted.stamp, field.reader()
         if self.stamps == 'auto':
             self.stamps = 'header' if field.header else 'source'
         if field.wraps:
@@ -92,7 +92,7 @@ class Source:
         self.on_names: Callable[[Any], None] | None = None
         self.listeners: list[Listener] = []
         self._served: list[Listener] = []  # those with a field
-        self._header: Field | None = None  # one of a message with a header
+        self._header = ''  # its name in a message
         self._subscription: Any = None
         self._timer: Any = None
 
@@ -135,7 +135,7 @@ class Source:
         for listener in self.listeners:
             listener.find(types, message_type)
         self._served = [listener for listener in self.listeners if listener.field]
-        self._header = next((li.field for li in self._served if li.field.header), None)
+        self._header = next((li.field.header for li in self.listeners if li.field), '')
         if self._subscription is None and (self._served or self.on_names):
             self.message_type = message_type
             self._subscription = subscribe_with_info(
@@ -181,7 +181,8 @@ class Source:
             self.on_names(getattr(message, 'name', None))
         stamps = {'source': published, 'reception': info['received_timestamp']}
         if self._header:
-            stamps['header'] = header = self._header.stamp(message)
+            stamp = getattr(message, self._header).stamp
+            stamps['header'] = header = stamp.sec * 1_000_000_000 + stamp.nanosec
             self.offset = published - header if header else 0
         for listener in self._served:
             try:
