@@ -24,6 +24,7 @@ def rules(*words: str) -> list[str]:
 # Node, arguments, words of the message; an argument with an end of line is put in a file. What is
 # said of files and values as such: test_parameters.py.
 E, P = 'estimator', 'plant'
+OF_U = "phi:=['0', '0', 'u']"
 OF_PLANT = 'plant: {ros__parameters: {order: 2}}\n'
 REFUSED = [
     # Files.
@@ -43,7 +44,7 @@ REFUSED = [
     (P, ['fast'], ["'fast'", 'usage: plant']),
     (P, ['-p', 'order:=3'], ["'-p'", '--ros-args']),
     # Topics and messages.
-    (E, rules('input_topic:=/a b'), ["expected the name of a topic, got '/a b'"]),
+    (E, rules('input_topic:=/a b'), ["'input_topic'", "'/a b'"]),
     (E, rules('input_topic:=/a', 'input_type:=sensor_msgs/JoinState'),
      ["'input_type'", 'written as in std_msgs/msg/Float64', 'sensor_msgs/JoinState']),
     (E, rules('input_type:=nobody/msg/No'),
@@ -52,6 +53,12 @@ REFUSED = [
      ["field 'angular_velocty.z'", 'sensor_msgs/msg/Imu', "mean 'angular_velocity.z'"]),
     (E, rules('input_type:=std_msgs/msg/Float64', 'input_stamp:=header'),
      ["'input_stamp'", 'messages with a header', 'std_msgs/msg/Float64']),
+    # Of known inputs, and of a node that waits to be configured, too.
+    (E, rules(OF_U, 'known_input_topics:=[/a b]'), ["'known_input_topics'", "'/a b'"]),
+    (E, rules(OF_U, 'known_input_types:=[nobody/msg/No]', 'autostart:=false'),
+     ["'known_input_types'", 'is installed here', 'nobody/msg/No']),
+    (E, rules(OF_U, 'known_input_types:=[sensor_msgs/msg/Imu]', 'autostart:=false'),
+     ['a field (input_field) is needed for sensor_msgs/msg/Imu']),
     # Channels.
     (E, rules('channels:=[a, b]', 'typed_outputs:=[wrench]'), ["'output_axis'", 'linear.x']),
     (E, rules('channels:=[hip]', 'hip.order:=2'),

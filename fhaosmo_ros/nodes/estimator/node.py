@@ -23,7 +23,7 @@ from fhaosmo_ros.inputs import known_inputs, measured_output, with_joints
 from fhaosmo_ros.messages.fields import listed
 from fhaosmo_ros.nodes.estimator.channel import Channel
 from fhaosmo_ros.nodes.estimator.outputs import parameter_text, TypedOutputs
-from fhaosmo_ros.nodes.estimator.sources import Sources
+from fhaosmo_ros.nodes.estimator.sources import check_inputs, Sources
 from fhaosmo_ros.nodes.middleware.diagnostics import (
     DiagnosticsPublisher,
     ERROR,
@@ -53,7 +53,7 @@ class EstimatorNode(ManagedNode):
     names of the channels.
 
     `given` are values of parameters, also of rclpy's own such as use_sim_time. Those that can't be
-    used raise ConfigurationError, unless the node waits to be configured.
+    used raise ConfigurationError before anything is subscribed or published.
     """
 
     def __init__(self, given: Mapping[str, Any] | None = None, **options: Any) -> None:
@@ -98,6 +98,7 @@ class EstimatorNode(ManagedNode):
                 estimators[name] = OnlineEstimator(mine)
             known = known_inputs(mine, estimators[name].observer.used_inputs, name)
             inputs += [measured_output(mine, name), *known.values()]
+        check_inputs(self, inputs)
         estimates = [
             f'~/{name}/{topic}' if name else f'~/{topic}'
             for name in names

@@ -6,7 +6,7 @@ The type of a topic is given, or found from the graph: then the subscription beg
 publishes a type that has a wanted field.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from copy import copy
 import math
 from time import time_ns
@@ -16,6 +16,7 @@ from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.inputs import Input
 from fhaosmo_ros.messages.fields import Field, find_field, MissingElementError, Unwrapper
 from fhaosmo_ros.nodes.middleware.endpoints import (
+    full_name,
     OVERRIDABLE,
     SENSOR_QOS,
     SequenceNumbers,
@@ -50,19 +51,13 @@ class Listener:
 
     def find(self, types: Mapping[str, Any], message_type: str) -> None:
         """Find its field in a message type, or keep the reason as `error`."""
-        wanted, self.error, self.field = self._wanted, '', None
+        self.error, self.field = '', None
         try:
-            field = find_field(types, message_type, wanted.field, wanted.name)
+            field = find_wanted(types, self._wanted._replace(message_type=message_type))
         except ConfigurationError as error:
             self.error = str(error)
             return
-        if wanted.stamp == 'header' and not field.header:
-            self.error = (
-                "parameters 'input_stamp', 'known_input_stamps': expected messages with a header "
-                f'on {wanted.topic} for the stamps header, got {message_type}'
-            )
-            return
-        self.field, self.stamps, self.value = field, wanted.stamp, field.reader()
+        self.field, self.stamps, self.value = field, self._wanted.stamp, field.reader()
         if self.stamps == 'auto':
             self.stamps = 'header' if field.header else 'source'
         if field.wraps:
@@ -97,18 +92,9 @@ class Source:
         self._timer: Any = None
 
     def open(self) -> None:
-        """
-        Subscribe, now or once the type of the topic is known.
-
-        Raises ConfigurationError if the given type is not installed, or has no such field.
-        """
+        """Subscribe, now or once the type of the topic is known."""
         if self.message_type:
-            try:
-                self._take_type(self.message_type)
-            except LookupError as error:
-                raise ConfigurationError(f"parameter 'input_type': {error}") from None
-            if error := next((li.error for li in self.listeners if li.error), ''):
-                raise ConfigurationError(error)
+            self._take_type(self.message_type)
         elif self._timer is None:
             self._timer = self._node.create_timer(
                 DISCOVERY_PERIOD, self._discover, clock=Clock(clock_type=ClockType.STEADY_TIME)
@@ -240,3 +226,26 @@ class Sources:
         """Look at the publishers of all topics."""
         for source in self._by_topic.values():
             source.look()
+
+
+def find_wanted(types: Mapping[str, Any], wanted: Input) -> Field:
+    """Return the field of an input in its message type, or raise ConfigurationError."""
+    field = find_field(types, wanted.message_type, wanted.field, wanted.name)
+    if wanted.stamp == 'header' and not field.header:
+        raise ConfigurationError(
+            "parameters 'input_stamp', 'known_input_stamps': expected messages with a header on "
+            f'{wanted.topic} for the stamps header, got {wanted.message_type}'
+        )
+    return field
+
+
+def check_inputs(node: Node, inputs: Iterable[Input]) -> None:
+    """Raise ConfigurationError for names, types or fields that cannot be, as far as given."""
+    for wanted in inputs:
+        full_name(node, wanted.topic, "parameters 'input_topic', 'known_input_topics': ")
+        if wanted.message_type:
+            try:
+                find_wanted(definitions(wanted.message_type), wanted)
+            except LookupError as error:
+                types = "parameter 'input_type' or 'known_input_types'"
+                raise ConfigurationError(f'{types}: {error}') from None

@@ -72,13 +72,13 @@ class Listeners:
         return self._heard
 
 
-def full_name(node: Node, topic: str) -> str:
-    """Return the full name of a topic, after remapping, or raise ConfigurationError."""
+def full_name(node: Node, topic: str, what: str = '') -> str:
+    """Return the full name of a topic, after remapping; raise (`what` first) if none can be."""
     try:
         return str(node.resolve_topic_name(topic))
     except RuntimeError as error:  # rcl's
         problem = re.sub(r'^.*?: |, at \S+$', '', str(error))
-        text = f'expected the name of a topic, got {topic!r} ({problem})'
+        text = f'{what}expected the name of a topic, got {topic!r} ({problem})'
         raise ConfigurationError(text) from None
 
 
