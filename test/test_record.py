@@ -187,7 +187,7 @@ def test_bag_is_played_in_its_own_time_and_an_estimator_restarts_with_the_next(t
             play = start('play', 'bag', *remapped, cwd=tmp_path)
             said = play.communicate(timeout=120)[0]
             assert play.returncode == 0
-        wait_until(lambda: 'restarts 1' in log.read_text(), 'restart', 300.0)
+        wait_until(lambda: '1 restarts: stamps jumped' in log.read_text(), 'restart', 300.0)
         wait_until(lambda: recorded.exists() and recorded.stat().st_size > 50_000, 'messages')
     finally:
         for process in processes:

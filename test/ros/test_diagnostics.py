@@ -171,7 +171,9 @@ def test_bad_samples_are_rejected_and_counted_and_many_are_an_error(fed):
     assert all(map(math.isfinite, [*after.z, after.unknown_input, after.gamma]))
     assert abs(after.z[0] - 0.2) < 0.1
     # Until a report has no good sample of before.
-    fed.wait_status('input', ERROR, 'rejected measurements', doing=lambda: fed.send(math.nan))
+    said = 'samples rejected: y was NaN, infinite or beyond 1e60'
+    fed.wait_status('input', ERROR, said, doing=lambda: fed.send(math.nan))
+    fed.wait_said('input: ', said)
 
 
 def test_freeze_holds_gamma_and_lets_it_go(fed):
@@ -214,7 +216,8 @@ def test_a_thing_that_reports_say_is_logged_at_most_every_five_seconds(fed):
         fed.send(math.nan)
     fed.wait_count('restarts', restarts + 5)
     fed.wait_count('rejected measurements', rejected + 20)
-    fed.user.wait(lambda: fed.send(1.0) and fed.said('input: ', 'restarts '), 'line of the log')
+    said_so = partial(fed.said, 'input: ', 'restarts: stamps jumped')
+    fed.user.wait(lambda: fed.send(1.0) and said_so(), 'line of the log')
     lines = [line.partition('input: ')[2] for line in fed.said('input: ')[said:]]
     kinds = [re.sub(r'[-+.\d]+', '', line) for line in lines]
     assert max(map(kinds.count, kinds)) <= 2 + (time.monotonic() - begin) // 5.0
@@ -235,8 +238,9 @@ def clock(user):
 
 def test_node_clock_sampling_follows_simulated_time(clock, estimator):
     rig = estimator('/sim', **FED | LAX, use_sim_time=True, sampling='clock')
-    rig.listen().send(0.2)
-    rig.wait_said('rejected a sample: nothing on /clock yet')
+    rig.listen()
+    said = 'samples rejected: nothing on /clock yet'
+    rig.wait_status('input', STALE, said, doing=lambda: rig.send(0.2))
     replay = OnlineEstimator({'max_gap': 60.0})
 
     def at(now: int, y: float) -> None:

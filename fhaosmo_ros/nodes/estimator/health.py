@@ -24,8 +24,34 @@ RATE_RATIO = 1.5
 """Factor between the rate of y and that of the gains that deserves one."""
 SPREAD = 3.0
 """Factor between the innovations and those expected that deserves one."""
-TOLD = ('restarts', 'stuck', 'late inputs', 'samples before any input')
-"""Counters whose growth deserves one, beside `UNUSED`."""
+SAID = {
+    'samples lost': '{n} samples lost: they did not arrive, or were damaged',
+    'rejected measurements': '{n} samples rejected: y was NaN, infinite or beyond 1e60',
+    'rejected spikes': '{n} samples rejected: y was further than spike_gate, or 6 usual '
+    'deviations, from its prediction',
+    'rejected stuck': '{n} samples rejected: y repeats itself, for longer than stuck_time or '
+    'although it has noise: its sensor is stuck',
+    'rejected steps': '{n} samples rejected: y would have made the estimate infinite',
+    'duplicate stamps': '{n} samples rejected: their stamps were those of the ones before',
+    'backward stamps': '{n} samples rejected: their stamps were older than those before',
+    'zero stamps': '{n} samples rejected: {zero}',
+    'far stamps': '{n} samples held back: stamps more than max_gap from the one before; the next '
+    'sample decides',
+    'rejected inputs': '{n} known inputs rejected: expected finite numbers; the last one is held',
+    'restarts': '{n} restarts: stamps jumped by more than max_gap; where y always comes so '
+    'slowly, set max_gap to several of its periods',
+    'late inputs': '{n} late inputs, which came after their sample had been used: raise '
+    'known_input_wait, or their header stamps are of another clock',
+    'samples before any input': '{n} samples before any input, whose stamps are all later: are '
+    'the header stamps of one clock?',
+    'divergences': 'diverged {n} times and started again from y: gains or model do not fit',
+    'jumps': 'y jumped {n} times: all estimates but that of z1 go on',
+}
+"""What is said of the counters that have grown, by `n`; `zero`: why stamps are 0."""
+ZERO = {
+    'clock': 'nothing on /clock yet',
+    'header': 'their stamps are 0: nobody fills the header; input_stamp: source does without it',
+}
 
 
 def _words(name: str) -> str:
@@ -34,6 +60,8 @@ def _words(name: str) -> str:
 
 UNUSED = ('samples lost', *map(_words, UNUSED_SAMPLES), 'rejected inputs')
 """Counters of samples that the observer has not taken."""
+OTHERS = ('restarts', 'late inputs', 'samples before any input')
+"""Other counters of the input whose growth deserves a warning."""
 
 
 class Health:
@@ -93,11 +121,12 @@ class Health:
         delay = source.delay * NANOSECONDS if source.delay > -inf else nan
         offset = source.offset * NANOSECONDS if y.stamps == 'header' else 0.0
         age = perf_counter() - self.latest
+        stamps = 'clock' if limits['sampling'] == 'clock' else y.stamps
         report = self._report('input', {
             'topic': source.topic,
             'type': source.message_type or 'not known yet',
             'field': y.field.text if y.field else 'not known yet',
-            'stamps': 'clock' if limits['sampling'] == 'clock' else y.stamps or 'not known yet',
+            'stamps': stamps or 'not known yet',
             'publishers': ', '.join(sorted(heard)) or 'none',
             'sample rate [Hz]': rate,
             'jitter (std / mean of the period)': jitter,
@@ -118,9 +147,11 @@ class Health:
         report.find(WARN, several, len(heard) > 1 and not lacking)
         report.find(WARN, f'{lacking} messages without y: {y.why}', lacking and not used)
         bad = sum(news[key] for key in UNUSED)
-        for key in (*UNUSED, *TOLD):
+        zero = ZERO.get(stamps, 'their stamps are 0')
+        for key in (*UNUSED, *OTHERS):
             many = key in UNUSED and bad > BAD_SHARE * (bad + used)
-            report.find(ERROR if many else WARN, f'{key} {news[key]}', news[key])
+            text = SAID[key].format(n=news[key], zero=zero)
+            report.find(ERROR if many else WARN, text, news[key])
         spread = news['spread stamps']
         ticks = f'/clock ticks once for {used / max(1, used - spread):.0f} samples'
         report.find(WARN, ticks, used < 2 * spread)
@@ -175,8 +206,8 @@ class Health:
         closed = estimate is not None and levels < observer.levels
         report.find(WARN, held, closed and not stale)
         diverged, jumps = news['divergences'], news['jumps']
-        report.find(ERROR, f'diverged and started again from y, {diverged} times', diverged)
-        report.find(WARN, f'y jumped {jumps} times', jumps)
+        report.find(ERROR, SAID['divergences'].format(n=diverged), diverged)
+        report.find(WARN, SAID['jumps'].format(n=jumps), jumps)
         report.find(WARN, f'y is taken as {offset:.3g} too large since it jumped', offset)
         if observer.configuration.adaptive and not observer.self_tuning:
             away = gamma - observer.parameters['gamma_initial']
