@@ -269,6 +269,9 @@ def test_node_clock_sampling_follows_simulated_time(clock, estimator):
             rig.send(2.0)
 
     rig.wait_status('input', WARN, 'ticks once for', doing=send)
+    rig.parameters.set(sampling='source_stamp')
+    rig.wait_status('input', WARN, "dt is in the host's time", 'set sampling to clock')
+    rig.wait_said('input: ', 'use_sim_time with sampling = source_stamp')
 
 
 def test_clocks_that_stand_still_go_back_below_zero_or_jump(user, clock, estimator, launch):

@@ -88,6 +88,13 @@ def test_yaw_and_known_input_from_the_message_of_y_and_typed_outputs(user, estim
     assert rig.value('unknown input [rad/s^2]')
 
 
+def test_simulated_time_takes_header_stamps_before_all_types_are_known(estimator):
+    kind = 'sensor_msgs/msg/JointState'
+    own = {'a.input_type': kind, 'b.input_topic': 'nobody', 'b.input_field': 'x'}
+    rig = estimator('/known', reliable=[], use_sim_time=True, channels=['a', 'b'], **own)
+    rig.wait_said('dt comes from the header stamps')
+
+
 def test_known_input_of_another_topic_is_that_of_the_stamp_of_y(user, estimator, launch, tmp_path):
     """It arrives after y, remapped; live, replayed and by the library the result is one."""
     model = {

@@ -52,6 +52,10 @@ ZERO = {
     'clock': 'nothing on /clock yet',
     'header': 'their stamps are 0: nobody fills the header; input_stamp: source does without it',
 }
+HOST_TIME = (
+    "use_sim_time with sampling = source_stamp: the middleware's stamps know nothing of /clock, "
+    "so dt is in the host's time; set sampling to clock for simulation time"
+)
 
 
 def _words(name: str) -> str:
@@ -162,6 +166,8 @@ class Health:
         side = 'before' if offset > 0.0 else 'after'
         apart = f'header stamps lie {abs(offset):.3g} s {side} publication'
         report.find(WARN, apart, not channel.simulated and abs(offset) > latest)
+        of_host = limits['sampling'] == 'source_stamp' and y.stamps == 'source'
+        report.find(WARN, HOST_TIME, channel.simulated and of_host)
         for name, u in channel.u.items():
             report.find(ERROR, u.error, u.error)
             for text in u.source.unheard:

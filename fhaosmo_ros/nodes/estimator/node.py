@@ -155,8 +155,8 @@ class EstimatorNode(ManagedNode):
         self.sources.open()
 
     def _found_type(self) -> None:
-        """Take dt from header stamps in simulated time, once it is known that all have them."""
-        stamps = {channel.y.stamps for channel in self._channels}
+        """Take dt from header stamps in simulated time, once those that are known are such."""
+        stamps = {channel.y.stamps for channel in self._channels if channel.y.stamps}
         if self._chooses_sampling and stamps == {'header'}:
             self._chooses_sampling = False
             self.get_logger().info('use_sim_time: dt comes from the header stamps')
