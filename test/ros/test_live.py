@@ -76,15 +76,16 @@ def test_live_events_are_those_of_a_replay(user, estimator):
     }  # fmt: skip
     rig = estimator('/events', **FED | values).listen()
     told = user.record('/events/estimator/event', DiagnosticArray, LATCHED)
-
+    user.wait(lambda: told, 'that there is no event yet')
+    assert told[0].message.status[0].message == 'no event yet'
     samples = [(rig.send(y), y) for k in range(400) for y in [1.0 if 100 <= k < 200 else 0.0]]
     replay = OnlineEstimator(values)
     replay.run(*zip(*samples, strict=True))
     events = replay.events.taken()
     assert events[0].begins
     assert len(events) >= 2
-    user.wait(lambda: len(told) >= len(events), 'events')
-    for (_, message), event in zip(told, events, strict=True):
+    user.wait(lambda: len(told) > len(events), 'events')
+    for (_, message), event in zip(told[1:], events, strict=True):
         said = values_of(message.status[0])
         assert nanoseconds(message.header.stamp) == event.stamp
         assert said['level'] == (WARN if event.begins else OK)

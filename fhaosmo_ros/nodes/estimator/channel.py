@@ -76,6 +76,8 @@ class Channel:
         self.pairing.forget_samples()
         self._health.begin()
         self._active = True
+        if self.estimator.events.on:
+            self._say(self._clock.now().nanoseconds, 'no event yet')
         observer = self.estimator.observer
         self.logger.info(
             f'estimating {observer.order} states and the unknown input from '
@@ -165,12 +167,16 @@ class Channel:
         unit = derivative_unit(self.values['measurement_unit'], self.estimator.observer.order)
         for event in self.estimator.events.taken():
             text, values = described(event, unit)
-            report = Report(f'{self.name} event'.lstrip(), values)
-            report.find(WARN if event.begins else OK, text)
-            hardware_id, time = self.values['hardware_id'], time_message(event.stamp)
-            self._events.publish(array_of(self._node, time, [report], hardware_id))
+            self._say(event.stamp, text, WARN if event.begins else OK, values)
             if event.begins:
                 self.logger.warning(f'event: {text}', throttle_duration_sec=QUIET)
+
+    def _say(self, stamp: int, text: str, level: bytes = OK, values: Any = None) -> None:
+        """Publish on the topic of events."""
+        report = Report(f'{self.name} event'.lstrip(), values)
+        report.find(level, text)
+        hardware_id, time = self.values['hardware_id'], time_message(stamp)
+        self._events.publish(array_of(self._node, time, [report], hardware_id))
 
     def reset(self, _: Trigger.Request | None = None) -> str:
         """Start the observer afresh with the next sample; return what has been done."""
