@@ -69,7 +69,7 @@ class EstimatorNode(ManagedNode):
         self._given = given
         self._names: list[str] = values[CHANNELS]
         self._joints: set[str] = set()  # of the message that the names come from
-        self._left_out = ''  # what is said of those that are no channels
+        self._left_out: list[str] = []  # what is said of those that are no channels
         self._channels: list[Channel] = []  # none before the names of the joints are known
         self._parameters_topic: Any = None
         self._node_parameters = NodeParameters(
@@ -170,16 +170,17 @@ class EstimatorNode(ManagedNode):
         if self._names != FROM_JOINTS:
             self.sources.of(measured_output(present)).on_names = None
             new = [name for name in names if name not in self._joints]
-            late = left_out(new, 'not in the first message')
-            self._left_out = '; '.join(filter(None, [self._left_out, late]))
+            self._left_out.append(left_out(new, 'not in the first message'))
             return
         most = present['max_channels']
-        fit = self._fitting(names)[:most]
-        self._left_out = left_out(
-            [name for name in names if name not in fit],
-            f'beyond max_channels ({most}), or not allowed as the name of a channel: name one, '
-            'and set its input_field to position[NAME]',
-        )
+        fit = self._fitting(names)
+        bad = [name for name in dict.fromkeys(names) if name not in fit]
+        hint = 'name a channel, and set its input_field to position[NAME]'
+        self._left_out = [
+            left_out(bad, f"can't be the name of a channel; {hint}"),
+            left_out(fit[most:], f'beyond max_channels ({most}); raise it'),
+        ]
+        fit = fit[:most]
         if not fit:
             return
         for name in set(with_own_parameters(present[CHANNELS], present)) - set(fit):
@@ -283,7 +284,8 @@ class EstimatorNode(ManagedNode):
             state.find(ERROR, f'use_sim_time, but nothing on {clock} yet')
         waits = active and not self._channels
         state.find(STALE, 'no message with the names of the joints yet', waits)
-        state.find(WARN, self._left_out, self._left_out)
+        for text in self._left_out:
+            state.find(WARN, text, text)
         reports = [state]
         if active and not waits:
             self.sources.look()
