@@ -57,13 +57,6 @@ def test_keywords_are_parameters(kind):
         assert word in repr(found)
 
 
-def test_columns_of_a_table_are_taken():
-    u = np.cos(T)
-    found = Observer(OSCILLATOR).run(T[:, np.newaxis], Y[:, np.newaxis], u[:, np.newaxis])
-    np.testing.assert_array_equal(found.z, Observer(OSCILLATOR).run(T, Y, u).z)
-    assert f'unknown_input={found.unknown_input[-1]:.4g}' in repr(found)
-
-
 def test_input_that_phi_uses_must_be_given():
     observer = Observer(OSCILLATOR)
     for call, *values in (observer.run, T, Y), (observer.smooth, T, Y), (observer.step, 0.1, 0.1):

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The simulated plant: disturbances by their formulas, noise, inputs; families of recordings."""
 
-from fhaosmo_ros.core import ConfigurationError, Family, Plant, TriangularModel
+from fhaosmo_ros.core import ConfigurationError, Family, Plant
 from fhaosmo_ros.core.simulation.plant import quantised, respond
 from fhaosmo_ros.core.simulation.system import KINDS
 import numpy as np
@@ -123,31 +123,6 @@ def test_recording_is_a_function_of_parameters_number_and_seed():
     for family, seed in (Family(SHORT), 8), (Family(SHORT | {'noise_seed': 2}), 7):
         assert not np.array_equal(family.recording(2, seed).d, several[2].d)
     assert [r.shape for r in several] == ['sines', 'steps', 'chirp', 'sines']
-
-
-@pytest.mark.parametrize('shape', ['sines', 'steps', 'chirp'])
-def test_d_has_its_size_stays_in_its_band_and_is_not_one_sine(shape):
-    d = Family({
-        'rms_of_d': 0.3, 'band_of_d': [2.0, 6.0], 'disturbances': [shape], 'duration': 60.0,
-        'integration_step': 1e-3, 'sample_rate': 100.0,
-    }).recording(0).d  # fmt: skip
-    np.testing.assert_allclose(np.sqrt(np.mean(d**2)), 0.3, rtol=0.05)
-    power = np.abs(np.fft.rfft(d * np.hanning(len(d)))) ** 2
-    omega = 2.0 * np.pi * np.fft.rfftfreq(len(d), 0.01)
-    parts, _ = np.histogram(omega, [1.7, 2.9, 4.2, 6.5], weights=power)
-    if shape != 'steps':
-        assert parts.sum() > 0.99 * power.sum()
-        assert parts.min() > 0.02 * power.sum()
-
-
-def test_response_is_that_of_the_plant():
-    """Between the table's points d is a line: its error is (omega spacing)^2 / 8 of d."""
-    t = np.arange(0.0, 5.0, 1e-3)
-    table = 0.1 * np.sin(3.0 * np.arange(0.0, 5.1, 1e-4))
-    z, d = respond(TriangularModel(['0', '0', '-z3']), [0.2, 0.2, 0.2], t, table, 1e-4)
-    truth = Plant({'disturbance_omega': 3.0, 'initial_state': 0.2}).simulate(t)
-    np.testing.assert_allclose(z, truth.z, atol=1e-7)
-    np.testing.assert_allclose(d, truth.unknown_input, atol=1e-8)
 
 
 def test_noise_quantisation_jitter_and_dropouts_are_as_asked():
