@@ -310,3 +310,4 @@ def test_written_file_has_no_alias():
     gains = [1.0, 2.0]
     text = dumps({'lambda': gains, 'alpha': gains})
     assert loads(text, 'estimator', ESTIMATOR_PARAMETERS) == {'lambda': gains, 'alpha': gains}
+    assert 'a longer integer' in refusal_of(ESTIMATOR_PARAMETERS['epsilon'].coerce, 10**5000)

@@ -317,5 +317,8 @@ def shown(value: Any) -> str:
         value = value.tolist()
     elif isinstance(value, Iterable) and not isinstance(value, str | bytes | Mapping):
         value = list(value)
-    text = repr(value)
+    try:
+        text = repr(value)
+    except ValueError:  # Python prints at most 4,300 digits
+        text = 'a longer integer'
     return text if len(text) <= 120 else text[:117] + '...'

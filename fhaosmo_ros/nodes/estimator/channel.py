@@ -66,7 +66,7 @@ class Channel:
     def _forget(self) -> None:
         self._arrived = False
         self._stale = True
-        self._heard_at = 0  # by the node's clock
+        self._silent_since: int | None = None  # by the node's clock
         self._waits_since = 0.0
 
     def activate(self) -> None:
@@ -150,15 +150,19 @@ class Channel:
             name = self.name or (self.y.field and self.y.field.key) or 'y'
             self._node.typed.add(name, (stamp, estimate, self.values))
 
-    def tick(self, now: int) -> None:
+    def tick(self) -> None:
         """Publish at the node's rate, if it is to, and until y is silent by the node's clock."""
         if self.pairing.by_stamp and perf_counter() - self._waits_since > self._longest_wait:
             self._take_paired(at_once=True)  # no sample follows that would release these
         if self._arrived:
             self._arrived = self._stale = False
-            self._heard_at = now
-        elif not 0 <= now - self._heard_at <= self.estimator.silence * 1e9:  # or it jumped back
-            self._stale = True
+            self._silent_since = None
+        elif not self._stale:
+            now = self._clock.now().nanoseconds
+            if self._silent_since is None:  # the clock is not read while samples come
+                self._silent_since = now
+            elif not 0 <= now - self._silent_since <= self.estimator.silence * 1e9:
+                self._stale = True  # or the clock jumped back
         if not self._stale and not self._on_samples:
             self._publish()
 

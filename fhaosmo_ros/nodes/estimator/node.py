@@ -232,9 +232,8 @@ class EstimatorNode(ManagedNode):
         self._channels, self._parameters_topic = [], None
 
     def _tick(self) -> None:
-        now = self.get_clock().now().nanoseconds
         for channel in self._channels:
-            channel.tick(now)
+            channel.tick()
         self.typed.publish()
 
     def _answer(
