@@ -135,7 +135,7 @@ class Channel:
         if not word & UNUSED:
             self._arrived, health.latest = True, now
             health.stamps.append(stamp)
-            health.durations.append(now - begin)
+            health.stepping += now - begin
             health.d.append(estimator.policy.structure.unknown_input)
             if now >= self._outputs.due:
                 self._outputs.snapshot_of(stamp)

@@ -72,14 +72,14 @@ class Health:
     """
     Remembers a few numbers of each sample of a `Channel`, and makes two reports of them.
 
-    Of each sample that was used they are its stamp (ns), the time of its step (s) and d. `latest`
-    is the time of the last one on `perf_counter`.
+    Of each sample that was used they are its stamp (ns) and d. `latest` is the time of the last
+    one on `perf_counter`, `stepping` how long the steps took in all (s).
     """
 
     def __init__(self, channel: Any) -> None:
         self._channel = channel
-        self.stamps, self.durations, self.d = array('q'), array('d'), array('d')
-        self.latest = nan
+        self.stamps, self.d = array('q'), array('d')
+        self.latest, self.stepping = nan, 0.0
         self._before = self._counts()
 
     def begin(self) -> None:
@@ -110,8 +110,8 @@ class Health:
         period = float(np.mean(periods)) if len(periods) else nan
         jitter = float(np.std(periods)) / period if period > 0.0 else nan
         reports = [self._input(news, stale, period, jitter), self._observer(news, stale, period)]
-        for numbers in (self.stamps, self.durations, self.d):
-            del numbers[:]
+        del self.stamps[:], self.d[:]
+        self.stepping = 0.0
         return reports
 
     def _report(self, task: str, values: Mapping[str, Any]) -> Report:
@@ -184,7 +184,7 @@ class Health:
         gamma, d = (estimate.gamma, estimate.unknown_input) if estimate else (nan, nan)
         levels = estimate.open_levels if estimate else 0
         spread = observer.structure.memory['spread']
-        past, steps = np.array(self.d), np.array(self.durations)
+        past, step = np.array(self.d), self.stepping / max(1, len(self.d))
         deviation = float(np.std(past)) if len(past) else nan
         index = min(1.0, high_passed(past, WINDOW) / deviation) if deviation > 0.0 else 0.0
         report = self._report('observer', {
@@ -194,7 +194,7 @@ class Health:
             'innovations over those expected': spread,
             titled('unknown input', unit): d,
             'chatter index (0 smooth, 1 nothing but chatter)': index,
-            'step time, mean [us]': 1e6 * float(np.sum(steps)) / max(1, len(steps)),
+            'step time, mean [us]': 1e6 * step,
         })  # fmt: skip
         if observer.self_tuning:
             tuning, d_error = observer.tuning, float(estimator.standard_deviation[-1])
@@ -225,6 +225,6 @@ class Health:
             report.find(WARN, rates, not tuned / RATE_RATIO < period < tuned * RATE_RATIO)
         wide = f'innovations are {spread:.3g} times as large as noise_size says'
         report.find(WARN, wide, spread > SPREAD)
-        slow = int(np.sum(steps > period))
-        report.find(WARN, f'{slow} steps took longer than the sampling period', slow)
+        slow = f'a step takes {step:.3g} s, longer than the sampling period: samples queue up'
+        report.find(WARN, slow, step > period)
         return report
