@@ -176,6 +176,22 @@ def test_a_host_that_stamps_later_for_dozens_of_samples(seed):
     assert np.abs(estimated(SELF_TUNING, late, noisy).unknown_input).max() < 2.0 * np.abs(d).max()
 
 
+@pytest.mark.parametrize('noise', [0.0, 1e-5])
+def test_a_sample_that_its_host_stamps_late_is_not_rejected(case, noise):
+    """A host that is busy between measuring and stamping makes the interval longer by as much."""
+    t, z, d, unit = case
+    rng = np.random.default_rng(5)
+    late = 1e-5 * PERIOD * rng.standard_exponential(len(t))
+    late[1000::97] += PERIOD * rng.uniform(0.1, 0.9, len(late[1000::97]))
+    results = [OnlineEstimator(order=3, phi=['0', '0', '-z3'], **SELF_TUNING) for _ in range(2)]
+    errors = [
+        rms((e.run(stamps_of(t + x), z[:, 0] + noise * unit).unknown_input - d)[5000:])
+        for e, x in zip(results, (0.0, late), strict=True)
+    ]
+    assert errors[1] < 1.5 * errors[0] + 0.02 * rms(d)
+    assert results[1].counters.rejected == 0
+
+
 @pytest.mark.parametrize('seed', [0, 10, 16])
 def test_a_usual_jump_of_d_is_believed_at_the_second_sample_and_two_outliers_are_none(seed):
     """With d = 0.2 at the start, too: what is usual is not known yet."""

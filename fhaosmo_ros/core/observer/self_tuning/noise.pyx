@@ -177,11 +177,12 @@ cdef VECTORISED find_knowing(Members* m, bint unlikely_before) noexcept nogil:
     w.sample.largest = fmax(APART * least, own)
 
 
-cdef bint is_likely(Members* m, double gate) noexcept nogil:
+cdef bint is_likely(Members* m, double gate, double of_stamp) noexcept nogil:
     """
     Return True if a member that can judge the sample finds it likely (D 29).
 
-    A member that is unlikely itself would meet y by chance.
+    A member that is unlikely itself would meet y by chance. `of_stamp` is the variance that the
+    sample's own stamp may add to that of y.
     """
     cdef Work* w = &m.work
     cdef double variance
@@ -189,7 +190,7 @@ cdef bint is_likely(Members* m, double gate) noexcept nogil:
     for g in range(m.shared.active):
         variance = w.believed[g] * w.noise[g]
         if variance <= w.sample.largest and m.score[g] > -FADED and (
-            w.b[g] * w.b[g] <= gate * gate * variance
+            w.b[g] * w.b[g] <= gate * gate * (variance + of_stamp)
         ):
             return True
     return False

@@ -220,7 +220,7 @@ cdef class SelfTuning(Structure):
         cdef Sample* sample = &w.sample
         cdef Memory* memory = &self.memory
         cdef double mean[MOST_STATES]
-        cdef double expected, since = 0.0, speed
+        cdef double expected, since = 0.0, speed, of_stamp
         cdef bint goes_on, likely, begins, jumped, rough, same
         cdef int i, since_jump = 0
         sample.quanta = rounding(m)
@@ -258,7 +258,8 @@ cdef class SelfTuning(Structure):
             memory.beyond > 0.0 and copysign(1.0, sample.off) == shared.far_sign
             and not rough and shared.roughness < HUBER
         )
-        likely = is_likely(m, HUBER if goes_on else GATE)
+        of_stamp = sample.irregular / 6.0 * speed * speed if memory.beyond == 0.0 else 0.0
+        likely = is_likely(m, HUBER if goes_on else GATE, of_stamp)
         shared.recent = fmax(shared.recent - 1.0, 0.0)
         begins = begins and not likely
         jumped = begins or (shared.recent > 0.0 and not rough)
