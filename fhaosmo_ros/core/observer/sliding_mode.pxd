@@ -51,7 +51,7 @@ cdef class SlidingMode(Structure):
 
 
 cdef double doubt_of_noise(double age, double speed) noexcept nogil
-cdef double follow_spread(Memory* memory, double b, double expected) noexcept nogil
+cdef double follow_spread(Memory* memory, double b, double expected, double late) noexcept nogil
 
 
 cdef inline Dual psi(SlidingMode law, int i, double a) noexcept nogil:

@@ -31,13 +31,13 @@ cdef double MEDIAN = 0.6745
 cdef double SPREAD_RATE = 0.005
 
 
-cdef double follow_spread(Memory* memory, double b, double expected) noexcept nogil:
+cdef double follow_spread(Memory* memory, double b, double expected, double late) noexcept nogil:
     """
     Return the size that innovations have: the expected one times the spread, which follows (D 21).
 
     The spread goes up by a small part of it where |b| is above its median if it were normal, and
     down by as much where |b| is below. So its size does not matter, and outliers hardly do. A
-    sample that is too far off is counted in `Memory.beyond`.
+    sample that is too far off is counted in `Memory.beyond`; a late stamp puts it off by `late`.
     """
     cdef double usual
     if fabs(b) > MEDIAN * memory.spread * expected:
@@ -45,7 +45,7 @@ cdef double follow_spread(Memory* memory, double b, double expected) noexcept no
     else:
         memory.spread = max(memory.spread / (1.0 + SPREAD_RATE), 1.0)
     usual = memory.spread * expected
-    if fabs(b) > GATE * usual:
+    if fabs(b) > GATE * usual + late:
         memory.beyond += 1.0
         memory.miss = b
         if memory.beyond == 1.0:

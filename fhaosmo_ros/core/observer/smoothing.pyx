@@ -257,7 +257,7 @@ cdef class Passes:
         cdef double s = now.p[0][0] + now.variance, e = now.y - now.x[0], share
         cdef double factor
         self.memory.spread = now.spread
-        factor = max(fabs(e) / (HUBER * follow_spread(&self.memory, e, sqrt(s))), 1.0)
+        factor = max(fabs(e) / (HUBER * follow_spread(&self.memory, e, sqrt(s), 0.0)), 1.0)
         now.spread = self.memory.spread
         if now.derivatives < 0.0 and factor > 1.0:
             for i in range(self.n):

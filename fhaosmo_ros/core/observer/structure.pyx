@@ -159,6 +159,8 @@ cdef class Structure:
                 memory.y, memory.pending = y, 0.0
                 mean = memory.period if memory.period > 0.0 else whole
                 memory.period = mean + FOLLOWING * (min(whole, 2.0 * mean) - mean)
+            memory.interval = whole - memory.since
+            memory.since = whole if word & REJECTED_SPIKE else 0.0
         if word & (REJECTED_MEASUREMENT | REJECTED_INPUT) and not word & REJECTED_PERIOD:
             memory.pending += h
         return word | self.measure(memory.y)
@@ -182,6 +184,17 @@ cdef class Structure:
         for i in range(self.prediction.n):
             self.prediction.z[i] = self.level[i - 1].z_tilde if i > 0 else self.memory.y
             self.prediction.dz[i] = 0.0
+
+    @final
+    cdef double change_of_interval(self, double h) noexcept nogil:
+        """
+        Return how much longer the interval before a sample is than the one before that.
+
+        By as much may a host that was busy have stamped it late. `h` is the time since the last
+        sample that was used.
+        """
+        cdef Memory* memory = &self.memory
+        return h - memory.since - memory.interval if memory.interval > 0.0 else 0.0
 
     @final
     cdef double estimate(self, int i) noexcept nogil:

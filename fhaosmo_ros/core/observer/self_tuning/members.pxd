@@ -102,8 +102,6 @@ cdef struct Shared:
     double first_noise  # variance of the noise when the members began
     double roughness  # short mean of the squared differences of y, over their usual size
     double grown  # how much larger than expected innovations and differences are of late, >= 1
-    double interval  # last one between two samples, taken or not (s)
-    double since  # time from the last sample taken to the last one (s)
     double jitter  # variance that the intervals of late say the stamps have at most (s^2)
     double of_stamps  # variance that it makes of y at the latest sample
     double quantum  # step of y of which the others may be multiples (unit of y)

@@ -11,8 +11,8 @@ cdef double divided(double quantum, double step, double y) noexcept nogil
 cdef void follow_quantum(Members* m) noexcept nogil
 cdef double rounding(Members* m) noexcept nogil
 cdef void follow_differences(Members* m, double y) noexcept nogil
-cdef void follow_stamps(Members* m, double h, bint unlikely_before) noexcept nogil
+cdef void follow_stamps(Members* m, double change) noexcept nogil
 cdef VECTORISED fill_noise(Members* m) noexcept nogil
 cdef VECTORISED find_knowing(Members* m, bint unlikely_before) noexcept nogil
-cdef bint is_likely(Members* m, double gate, double of_stamp) noexcept nogil
+cdef bint is_likely(Members* m, double gate, double late) noexcept nogil
 cdef VECTORISED follow_noise(Members* m) noexcept nogil

@@ -128,25 +128,21 @@ cdef void follow_differences(Members* m, double y) noexcept nogil:
     )
 
 
-cdef void follow_stamps(Members* m, double h, bint unlikely_before) noexcept nogil:
+cdef void follow_stamps(Members* m, double change) noexcept nogil:
     """
-    Follow what irregular intervals say that the variance of the stamps is at most (D 29).
+    Follow what changes of the interval say that the variance of the stamps is at most (D 29).
 
     Differences of y do not show that its stamps are wrong, but innovations do. In the sample,
-    `irregular` is the square of what its own stamp may be off by, `roughness` counts it, too. If
-    samples before were unlikely, `h` is the time since one that was not.
+    `irregular` is the square of what its own stamp may be off by, `roughness` counts it, too.
     """
     cdef Shared* shared = &m.shared
     cdef Sample* sample = &m.work.sample
     cdef double least = EXACT * shared.steady_period, r
-    cdef double interval = h - shared.since if unlikely_before else h
-    sample.irregular = interval - shared.interval  # three stamps, one of them twice: 1 + 4 + 1
-    sample.irregular *= sample.irregular
-    r = sample.irregular / (6.0 * shared.jitter)
+    sample.irregular = change * change
+    r = sample.irregular / (6.0 * shared.jitter)  # three stamps, one of them twice: 1 + 4 + 1
     sample.roughness = fmax(sample.roughness, r)
     shared.jitter *= 1.0 + (fmin(r, HUBER * HUBER) / CLIPPED - 1.0) / ROUGH_SAMPLES
     shared.jitter = fmax(shared.jitter, least * least)
-    shared.interval, shared.since = interval, h
 
 
 cdef VECTORISED fill_noise(Members* m) noexcept nogil:
@@ -177,20 +173,20 @@ cdef VECTORISED find_knowing(Members* m, bint unlikely_before) noexcept nogil:
     w.sample.largest = fmax(APART * least, own)
 
 
-cdef bint is_likely(Members* m, double gate, double of_stamp) noexcept nogil:
+cdef bint is_likely(Members* m, double gate, double late) noexcept nogil:
     """
     Return True if a member that can judge the sample finds it likely (D 29).
 
-    A member that is unlikely itself would meet y by chance. `of_stamp` is the variance that the
-    sample's own stamp may add to that of y.
+    A member that is unlikely itself would meet y by chance. A late stamp puts y off by `late`.
     """
     cdef Work* w = &m.work
-    cdef double variance
+    cdef double variance, off
     cdef int g
     for g in range(m.shared.active):
         variance = w.believed[g] * w.noise[g]
+        off = fmax(fabs(w.b[g]) - late, 0.0)
         if variance <= w.sample.largest and m.score[g] > -FADED and (
-            w.b[g] * w.b[g] <= gate * gate * (variance + of_stamp)
+            off * off <= gate * gate * variance
         ):
             return True
     return False

@@ -220,19 +220,21 @@ cdef class SelfTuning(Structure):
         cdef Sample* sample = &w.sample
         cdef Memory* memory = &self.memory
         cdef double mean[MOST_STATES]
-        cdef double expected, since = 0.0, speed, of_stamp
+        cdef double expected, since = 0.0, speed, change, late
         cdef bint goes_on, likely, begins, jumped, rough, same
         cdef int i, since_jump = 0
         sample.quanta = rounding(m)
         if choose_members(m, sample.quanta):
             weigh(m)
         follow_differences(m, y)
-        follow_stamps(m, h, memory.beyond > 0.0)
+        change = self.change_of_interval(h)
+        follow_stamps(m, change)
         same = fabs(h - shared.flow_period) <= EXACT * shared.flow_period
         self.carry_flow(h, u, same)
         speed = (self.prediction.z[0] - self.level[0].z_hat) / h
         shared.of_stamps = shared.jitter * speed * speed
         sample.uneven += fmax(shared.jitter, sample.irregular) * speed * speed
+        late = fabs(speed * change) if memory.beyond == 0.0 else 0.0
         fill_noise(m)
         self.follow_period(h, same)
         rough = sample.roughness > HUBER * HUBER
@@ -258,8 +260,7 @@ cdef class SelfTuning(Structure):
             memory.beyond > 0.0 and copysign(1.0, sample.off) == shared.far_sign
             and not rough and shared.roughness < HUBER
         )
-        of_stamp = sample.irregular / 6.0 * speed * speed if memory.beyond == 0.0 else 0.0
-        likely = is_likely(m, HUBER if goes_on else GATE, of_stamp)
+        likely = is_likely(m, HUBER if goes_on else GATE, late)
         shared.recent = fmax(shared.recent - 1.0, 0.0)
         begins = begins and not likely
         jumped = begins or (shared.recent > 0.0 and not rough)

@@ -125,7 +125,7 @@ cdef double find_noise(Members* m, double least, double largest) noexcept nogil:
         period += m.first_h[i] / (FIRST_SAMPLES - 1)
         values[i - 1] = fabs(m.first_h[i] - m.first_h[i - 1])
     size = median(values + 1, FIRST_SAMPLES - 2) / MEDIAN
-    shared.steady_period, shared.interval = period, m.first_h[FIRST_SAMPLES - 1]
+    shared.steady_period = period
     shared.jitter = fmax(size * size / 6.0, (EXACT * period) * (EXACT * period))
     noise = fmax(noise, least)
     for order in range(m.n + 2):
