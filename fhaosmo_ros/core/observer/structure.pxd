@@ -32,8 +32,6 @@ cdef struct Memory:
     double y  # last accepted sample, less `offset`; NaN before the first (unit of y)
     double pending  # time of rejected samples, to be added to the next step (s)
     double period  # running mean of the intervals between samples (s)
-    double interval  # the last one, also between samples that are not likely (s); 0: none yet
-    double since  # time from the last sample that was used to the last one (s)
     double offset  # what y is more than z_1, since a jump that the model contradicts (D 23)
     double jumps  # sum of the jumps of y, 0 once it is back (D 23, unit of y)
     double beyond  # samples in a row that are too far from their prediction to be likely (D 21)
@@ -49,6 +47,9 @@ cdef struct Memory:
     double settled  # 1: the gains are the tuned ones; else minus the time since the start (D 20)
     double narrowed  # by what the limit of the influence of innovations is below HUBER (D 32)
     double one_sided  # samples in a row beyond that limit on one side; < 0 on the lower (D 32)
+    # What those remember that judge samples.
+    double interval  # the last one between two samples, likely or not (s); 0: none yet
+    double since  # time from the last sample that was used to the last one (s)
 
 
 cdef class Structure:
@@ -81,7 +82,7 @@ cdef class Structure:
     cdef int step(self, double y, double h, const double* u) noexcept nogil
     cdef int measure(self, double y) noexcept nogil
     cdef void begin_at_estimates(self) noexcept nogil
-    cdef double change_of_interval(self, double h) noexcept nogil
+    cdef double follow_interval(self, double h) noexcept nogil
     cdef double estimate(self, int i) noexcept nogil
     cdef void reset(self) noexcept nogil
     cdef void enter(self) except *

@@ -159,8 +159,6 @@ cdef class Structure:
                 memory.y, memory.pending = y, 0.0
                 mean = memory.period if memory.period > 0.0 else whole
                 memory.period = mean + FOLLOWING * (min(whole, 2.0 * mean) - mean)
-            memory.interval = whole - memory.since
-            memory.since = whole if word & REJECTED_SPIKE else 0.0
         if word & (REJECTED_MEASUREMENT | REJECTED_INPUT) and not word & REJECTED_PERIOD:
             memory.pending += h
         return word | self.measure(memory.y)
@@ -186,15 +184,18 @@ cdef class Structure:
             self.prediction.dz[i] = 0.0
 
     @final
-    cdef double change_of_interval(self, double h) noexcept nogil:
+    cdef double follow_interval(self, double h) noexcept nogil:
         """
         Return how much longer the interval before a sample is than the one before that.
 
         By as much may a host that was busy have stamped it late. `h` is the time since the last
-        sample that was used.
+        sample that was used; called once for each sample.
         """
         cdef Memory* memory = &self.memory
-        return h - memory.since - memory.interval if memory.interval > 0.0 else 0.0
+        cdef double interval = h - memory.since if memory.beyond > 0.0 else h
+        cdef double change = interval - memory.interval if memory.interval > 0.0 else 0.0
+        memory.interval, memory.since = interval, h
+        return change
 
     @final
     cdef double estimate(self, int i) noexcept nogil:

@@ -227,7 +227,7 @@ cdef class SelfTuning(Structure):
         if choose_members(m, sample.quanta):
             weigh(m)
         follow_differences(m, y)
-        change = self.change_of_interval(h)
+        change = self.follow_interval(h)
         follow_stamps(m, change)
         same = fabs(h - shared.flow_period) <= EXACT * shared.flow_period
         self.carry_flow(h, u, same)
