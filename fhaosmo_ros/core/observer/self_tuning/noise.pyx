@@ -35,10 +35,10 @@ cdef double ROUGH_SAMPLES = 100.0  # squared differences of y are averaged over 
 # Where intervals are uneven by more than this part of the period, so are the stamps: a host stamps
 # a sample some microseconds late, by a little more or less for dozens of samples, and a y that is
 # taken to be free of that would make a d of it.
-cdef double PROMPT = 0.01
+cdef double PROMPT = 0.02
 # Where the highest differences of y are more than FLAT times those of the order below, as
-# variances of white noise, they are noise, of at least FLAT^2 times that variance: what is smooth
-# has far smaller ones.
+# variances of white noise, they are noise, of at least FLAT^2 times that variance, less what
+# uneven intervals make of a y that moves: what is smooth has far smaller ones.
 cdef double FLAT = 0.5
 cdef double ROUNDED = 1e-12  # what is less than this part of a number may be an error of 64 bits
 cdef double ROUGH = 2.0  # the variance of the noise is at most so many times what they say
@@ -204,7 +204,8 @@ cdef VECTORISED follow_noise(Members* m) noexcept nogil:
     cdef double best[COLOURS]
     cdef double weights[COLOURS]
     cdef double squares[COLOURS]
-    cdef double variance, ratio, off, weight, least, most, more, share, average = sample.average
+    cdef double variance, ratio, off, weight, least, most, more, share, rest
+    cdef double average = sample.average
     cdef double widest = sample.largest, prompt = PROMPT * m.shared.steady_period
     cdef int c, p
     cdef Py_ssize_t g, active = m.shared.active
@@ -243,5 +244,6 @@ cdef VECTORISED follow_noise(Members* m) noexcept nogil:
             most = fmin(most, m.rough[c][p])
         m.noise[c] = fmax(fmin(m.noise[c], ROUGH * most), sample.floor)
         if m.rough[c][m.n + 1] > FLAT * m.rough[c][m.n]:
-            m.noise[c] = fmax(m.noise[c], FLAT * FLAT * m.rough[c][m.n + 1])
+            rest = m.rough[c][m.n + 1] - m.shared.of_stamps
+            m.noise[c] = fmax(m.noise[c], FLAT * FLAT * rest)
     fill_noise(m)
