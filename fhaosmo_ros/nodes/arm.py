@@ -14,7 +14,7 @@ from fhaosmo_ros.core.parameters.files import complete
 from fhaosmo_ros.core.parameters.tables import ARM_NODE_PARAMETERS
 from fhaosmo_ros.messages.joints import joint_sample
 from fhaosmo_ros.nodes.middleware import diagnostics, endpoints
-from fhaosmo_ros.nodes.middleware.diagnostics import ERROR, OK, STALE, WARN
+from fhaosmo_ros.nodes.middleware.diagnostics import ERROR, OK, QUIET, STALE, WARN
 from fhaosmo_ros.nodes.middleware.endpoints import LATCHED, SENSOR_QOS
 from fhaosmo_ros.nodes.middleware.messages import time_message
 from fhaosmo_ros.nodes.middleware.parameters import built_in, NodeParameters
@@ -28,8 +28,6 @@ from std_srvs.srv import Trigger
 
 SILENT = 0.5
 """Seconds without a sample that are reported."""
-QUIET = 5.0
-"""Seconds between two lines of the log about one problem."""
 FIELDS = {
     'external_torque': {'effort': 'external_torque'},
     'standard_deviation': {'effort': 'standard_deviation'},

@@ -105,7 +105,7 @@ cdef class Levant(SlidingMode):
         cdef Row* p = self.trial_covariance
         cdef int i, n = self.levels
         cdef double period = self.correction_period, variance = self.steady_variance, doubt = 1.0
-        cdef double b, moved, late, usual, largest = 1.0
+        cdef double b, change, moved, late = 0.0, usual, largest = 1.0
         cdef bint far, holds = memory.settled > 0.0 and fabs(h - period) <= NEAR * period
         cdef bint scheduling = self.scheduled and not holds
         if scheduling:
@@ -125,9 +125,10 @@ cdef class Levant(SlidingMode):
             self.correct_levels(y, h)
             return
         b = y - self.level[0].z_hat
-        late = self.follow_interval(h)
-        moved = self.level[0].z_hat - self.before[0].z_hat
-        late = fabs(moved / h * late) if memory.beyond == 0.0 else 0.0
+        change = self.follow_interval(h)
+        if memory.beyond == 0.0:
+            moved = self.level[0].z_hat - self.before[0].z_hat
+            late = fabs(moved / h * change)
         usual = follow_spread(memory, b, sqrt(variance), late)
         if variance < NEARLY_STEADY * self.steady_variance:  # a large P counts on all of b
             y = self.level[0].z_hat + self.influence(b, usual)
