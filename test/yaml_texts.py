@@ -12,7 +12,7 @@ for one, other in zip('abcdefgh', 'bcdefghi', strict=True):
 
 HOSTILE = {
     'date': '2020-99-99', 'float': '!!float x', 'bool': '!!bool x', 'timestamp': '!!timestamp x',
-    'binary': '!!binary \u00e9', 'map': '!!map x',
+    'binary': '!!binary \u00e9', 'map': '!!map x', 'list as key, tagged': '!!seq x: 1',
     'python': '!!python/object/apply:os.system [true]', 'long tag': '!<' + 'a' * 100_000 + '> b',
     'empty binary integer': '0b_', 'empty hexadecimal integer': '[0x_]',
     '4301 digits': '1' * 4301, 'hexadecimal digits': '0x' + 'f' * 4000,

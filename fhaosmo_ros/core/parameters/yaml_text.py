@@ -15,13 +15,13 @@ MAX_VALUES = 50_000
 """Keys, values, lists and mappings of a text."""
 MAX_DEPTH = 30
 """Lists and mappings within each other."""
-
 MAX_BITS = 1024
 """Of an integer: no double is larger."""
 
 TAG = 'tag:yaml.org,2002:'
 SCALARS = {TAG + name for name in ('null', 'bool', 'int', 'float', 'str')}
-TAGS = {None, '!', TAG + 'seq', TAG + 'map', *SCALARS}
+TAGS = {yaml.SequenceStartEvent: {TAG + 'seq'}, yaml.MappingStartEvent: {TAG + 'map'}}
+"""Of what begins with such an event; all else is a scalar."""
 
 
 class _Loader(PARSER):  # type: ignore[misc, valid-type]
@@ -34,8 +34,6 @@ class _Loader(PARSER):  # type: ignore[misc, valid-type]
     def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
         """Return the keys and values of a mapping."""
         content: dict[Any, Any] = {}
-        if not isinstance(node, yaml.MappingNode):  # another node with this tag
-            raise _refused(node, 'a mapping that is none')
         for key_node, value_node in node.value:
             if not isinstance(key_node, yaml.ScalarNode):
                 raise _refused(key_node, 'a key that is no plain text')
@@ -110,7 +108,7 @@ def _check(text: str) -> None:
         if isinstance(event, yaml.AliasEvent):
             raise _refused(event, f'the alias *{event.anchor}, which ROS does not read either')
         tag = getattr(event, 'tag', None)
-        if tag not in TAGS:
+        if tag not in {None, '!'} | TAGS.get(type(event), SCALARS):
             raise _refused(event, f'the tag {tag!r}')
 
 
