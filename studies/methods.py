@@ -29,7 +29,7 @@ from fhaosmo_ros.core.parameters.files import load
 from fhaosmo_ros.core.parameters.tables import OBSERVER_PARAMETERS
 from fhaosmo_ros.core.simulation.metrics import rms
 from fhaosmo_ros.tools.cli.command import shipped
-from fhaosmo_ros.tools.tuning.likelihood import Samples
+from fhaosmo_ros.tools.tuning.identify import Samples
 from fhaosmo_ros.tools.tuning.objective import SMALLEST, TUNE_PARAMETERS
 from fhaosmo_ros.tools.tuning.search import BAD, Dimension, minimise
 from fhaosmo_ros.tools.tuning.tuner import DERIVATIVES, RATES, Tuner
@@ -172,7 +172,7 @@ def tune(
     elif len(space) == 1:
         values = _scan(judged, space[0], trials)
     elif space:
-        values = minimise(judged, space, trials, seed).best
+        values = minimise(judged, space, trials, seed).best_params
     return trial(method, setting, values, recordings)
 
 
@@ -304,8 +304,8 @@ def each_order(search: Search) -> Values:
             max(1, search.trials // len(TRIED)),
             search.seed,
         )
-        if not best[1] or found.value < best[0]:
-            best = found.value, fixed | found.best
+        if not best[1] or found.best_value < best[0]:
+            best = found.best_value, fixed | found.best_params
     return best[1]
 
 
@@ -334,7 +334,7 @@ def _tune(search: Search) -> Values:
     recordings = list(search.recordings)
     with redirect_stderr(StringIO()):  # its progress bars
         tuner = Tuner(recordings, recordings[:1], {}, tuning, search.seed)
-        return tuner.parameters(tuner.search(max(1, search.trials - GRID)).best)
+        return tuner.parameters(tuner.search(max(1, search.trials - GRID)).best_params)
 
 
 def _one_bandwidth(s: Setting) -> Sequence[Dimension]:

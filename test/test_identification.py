@@ -8,8 +8,7 @@ from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
 from fhaosmo_ros.core.simulation.metrics import rms
 from fhaosmo_ros.tools.tuning import identify
 from fhaosmo_ros.tools.tuning.command import main
-from fhaosmo_ros.tools.tuning.identify import make_gains, whiteness
-from fhaosmo_ros.tools.tuning.likelihood import Design
+from fhaosmo_ros.tools.tuning.identify import Design
 from fhaosmo_ros.tools.tuning.objective import stamps_of
 from fhaosmo_ros.tools.tuning.report import notes
 import numpy as np
@@ -38,8 +37,8 @@ def found_in(y, phi=PHI, **given):
     given = {'order': len(phi), 'phi': list(phi)} | given
     values = ESTIMATOR_PARAMETERS.complete(given)
     model = TriangularModel.of(values)
-    found = identify.identify_input((T, y, np.zeros((K, 1))), model, values, given)
-    return found, make_gains(found, given)
+    found = identify.Identification((T, y, np.zeros((K, 1))), model, values, given)
+    return found, *found.gains()
 
 
 @pytest.fixture(scope='module', name='plain')
@@ -48,56 +47,55 @@ def _plain():
 
 
 def test_truth_is_likelier_than_other_designs(plain):
-    likelihood = plain[0].likelihood
+    found, *_ = plain
     bandwidth = ((SIZE**2 * (2.0 * RATE) ** 3 / 2.0) / (NOISE**2 * H)) ** (1 / 8)
     truth = Design(1, bandwidth, RATE / bandwidth)
-    assert likelihood.size_of_input(truth, NOISE) == pytest.approx(SIZE)
-    best = likelihood(truth).log_likelihood
+    assert found.size_of_input(truth, NOISE) == pytest.approx(SIZE)
+    best = found.evaluate(truth).log_likelihood
     for change in ({'bandwidth': 1.5 * bandwidth}, {'ratio': 10.0 * truth.ratio}):
-        assert likelihood(truth._replace(**change)).log_likelihood < best - 3.0
-    assert plain[0].best.log_likelihood > best - 1.0
+        assert found.evaluate(truth._replace(**change)).log_likelihood < best - 3.0
+    assert found.best.log_likelihood > best - 1.0
 
 
 def test_noise_and_size_of_d_are_found(plain):
-    found, gains = plain
+    found, gains, expected = plain
     assert found.best.noise == pytest.approx(NOISE, rel=0.03)
-    assert 0.5 * SIZE < found.size_of_input < 2.0 * SIZE
+    assert 0.5 * SIZE < gains['unknown_input_size'] < 2.0 * SIZE
     assert 0.3 * RATE < found.best.design.decay < 3.0 * RATE
-    assert whiteness(found)[1] > 1e-3
-    along = OnlineEstimator(gains.parameters).run(stamps_of(T), found.likelihood.samples.y)
+    assert found.whiteness()[1] > 1e-3
+    along = OnlineEstimator(gains).run(stamps_of(T), found.samples.y)
     error = rms((along.unknown_input - plant()[:, 2])[K // 10 :])
-    assert error == pytest.approx(gains.expected[-1], rel=0.25)
+    assert error == pytest.approx(expected[-1], rel=0.25)
 
 
 def test_gains_are_those_of_the_likeliest_filter(plain):
     """The observer of the YAML follows the filter whose likelihood was maximised."""
-    found, gains = plain
-    y = found.likelihood.samples.y
-    estimate = Observer(gains.parameters).run(T, y)
-    late, expected = slice(K // 4, None), found.best.estimates
+    found, gains, expected = plain
+    estimate = Observer(gains).run(T, found.samples.y)
+    late, filtered = slice(K // 4, None), found.best.estimates
     for i, column in enumerate([*estimate.z.T, estimate.unknown_input]):
-        apart = np.sqrt(np.mean((column - expected[:, i])[late] ** 2))
-        assert apart < 0.25 * gains.expected[i], i
+        apart = np.sqrt(np.mean((column - filtered[:, i])[late] ** 2))
+        assert apart < 0.25 * expected[i], i
 
 
 def test_outliers_are_left_out_and_told(plain):
     y = plant()[:, 0] + noise()
     y[7::150] += 50.0 * NOISE * (-1.0) ** np.arange(len(y[7::150]))
-    found, gains = found_in(y)
+    found, gains, expected = found_in(y)
     assert found.outliers == len(y[7::150])
-    assert any('outliers' in text for text in notes(found, *whiteness(found)))
-    assert list(notes(plain[0], *whiteness(plain[0]))) == []
+    assert any('outliers' in text for text in notes(found, *found.whiteness()))
+    assert list(notes(plain[0], *plain[0].whiteness())) == []
     assert found.best.noise == pytest.approx(plain[0].best.noise, rel=0.02)
-    assert gains.expected[-1] == pytest.approx(plain[1].expected[-1], rel=0.15)
-    along = OnlineEstimator(gains.parameters)
+    assert expected[-1] == pytest.approx(plain[2][-1], rel=0.15)
+    along = OnlineEstimator(gains)
     along.run(stamps_of(T), y)
     assert along.counters.divergences == 0
 
 
 def test_given_values_stay():
     given = {'noise_size': 2e-3, 'unknown_input_derivatives': 0, 'unknown_input_decay': 1.5}
-    found, gains = found_in(plant()[:, 0] + noise(), **given)
-    assert given.items() <= gains.parameters.items()
+    found, gains, _ = found_in(plant()[:, 0] + noise(), **given)
+    assert given.items() <= gains.items()
     assert (found.best.noise, found.best.design.decay) == pytest.approx((2e-3, 1.5))
 
 
@@ -128,8 +126,8 @@ def test_where_there_are_no_gains_it_says_why(y, phi, about):
     (lambda: plant()[:, 0] + lfilter([1.0], [1.0, -0.5], noise()), PHI, 'not white'),
 ])  # fmt: skip
 def test_model_that_does_not_fit_is_told(y, phi, about):
-    found, _ = found_in(y(), phi=phi)
-    assert about in ' '.join(notes(found, *whiteness(found)))
+    found, *_ = found_in(y(), phi=phi)
+    assert about in ' '.join(notes(found, *found.whiteness()))
 
 
 @pytest.mark.parametrize('quantum', [0.0, 1e-3])

@@ -53,8 +53,8 @@ def test_errors_are_those_of_the_nodes_estimator(weights):
     recordings = Family(SHORT | {'noise_std': 1e-3, 'dropout': 0.05}).recordings(3)
     objective = Objective(recordings, VALUES.changed({'weights': weights}))
     gains = {'lambda': [3.0, 2.0, 2.0, 0.5], 'alpha': [2.0, 1.0, 2.0, 1.5], 'epsilon': 40.0}
-    found = objective(gains)
-    for r, errors in zip(recordings, found.errors, strict=True):
+    error, found = objective(gains)
+    for r, errors in zip(recordings, found, strict=True):
         e, late = online(gains, r), r.t - r.t[0] >= 1.0
         expected = [rms((e.z - r.z)[late, i]) for i in range(3)]
         expected.append(rms((e.unknown_input - r.d)[late]))
@@ -62,14 +62,14 @@ def test_errors_are_those_of_the_nodes_estimator(weights):
     truth = np.concatenate([r.d[r.t - r.t[0] >= 1.0] for r in recordings])
     assert objective.scale[-1] == pytest.approx(rms(truth))
     w = np.array(weights) if weights[1:] else np.array([0.0, 0.0, 0.0, 1.0])
-    each = np.sqrt((found.errors / objective.scale) ** 2 @ w / w.sum())
-    assert found.error == pytest.approx(np.exp(np.mean(np.log(each))))
+    each = np.sqrt((found / objective.scale) ** 2 @ w / w.sum())
+    assert error == pytest.approx(np.exp(np.mean(np.log(each))))
 
 
 def test_infinite_estimate_is_the_worst_and_another_model_is_refused():
     wild = {'lambda': 1e6, 'alpha': 1e9, 'fuzzy_widths': 1e-12, 'epsilon': 1e12}
     objective = Objective(Family(SHORT).recordings(1), VALUES)
-    assert objective(wild | {'scheme': 'explicit'}).error > 1e3
+    assert objective(wild | {'scheme': 'explicit'})[0] > 1e3
     with pytest.raises(ConfigurationError, match=r"'order': expected 3, .*got 2"):
         objective({'order': 2, 'phi': ['0', '0']})
 
@@ -87,7 +87,7 @@ def test_start_is_nearly_as_good_as_the_best_kalman_filter():
         ]
         best = min(best, np.exp(np.mean(np.log(errors))) / tuner.training.scale[-1])
     start = {d.name: d.start for d in tuner.space}
-    assert tuner.training(tuner.parameters(start)).error < 1.03 * best
+    assert tuner.training(tuner.parameters(start))[0] < 1.03 * best
     # Held-out recordings have other seeds, and errors are relative to the same scale.
     pairs = product(tuner.training.recordings, tuner.held_out.recordings)
     assert not any(np.array_equal(a.y, b.y) or np.array_equal(a.d, b.d) for a, b in pairs)
@@ -135,8 +135,8 @@ def test_estimator_loads_the_output_and_the_next_tuning_begins_there(arguments, 
     assert head in report
     assert head in capsys.readouterr().out
     # What the report says of the gains is what these very gains do.
-    judged = Objective(Family(SHORT).recordings(2, 1), VALUES)(values)
-    assert f'{judged.error:.4f}' == row(report, 'error, relative')[4].strip()
+    judged = Objective(Family(SHORT).recordings(2, 1), VALUES)(values)[0]
+    assert f'{judged:.4f}' == row(report, 'error, relative')[4].strip()
     given = str(first / 'gains.yaml')
     assert main([*arguments, '--trials=3', '--params-file', given, '-o', str(out)]) == 0
     report = (out / 'report.md').read_text()
@@ -202,7 +202,7 @@ def test_presets_fit_the_noise_in_their_name(noise):
     family = Family({'noise_std': float(noise), 'integration_step': 1e-3})
     objective = Objective(family.recordings(3, seed=77), TUNE_PARAMETERS.defaults())
     demo = load(ROOT / 'config' / 'demo.yaml', 'estimator')
-    assert objective(values).error < min(0.95, 0.9 * objective(demo).error)
+    assert objective(values)[0] < min(0.95, 0.9 * objective(demo)[0])
 
 
 SPACE = [Dimension('a', 1e-3, 1e3, 1.0), Dimension('b', -5.0, 5.0, 0.0, log=False)]
@@ -214,15 +214,16 @@ def bowl(values):
 
 def test_minimum_is_found_from_the_start_on_as_the_seed_says():
     seen = []
-    result = minimise(lambda v: bowl(seen.append(v) or v), SPACE, trials=250, seed=3)
+    study = minimise(lambda v: bowl(seen.append(v) or v), SPACE, trials=250, seed=3)
     assert seen[0] == {'a': 1.0, 'b': 0.0}
-    assert len(seen) == result.trials == 250
-    assert result.value == bowl(result.best) == min(map(bowl, seen)) < 1e-2
-    assert [minimise(bowl, SPACE, 250, seed) == result for seed in (3, 4)] == [True, False]
+    assert len(seen) == len(study.trials) == 250
+    assert study.best_value == bowl(study.best_params) == min(map(bowl, seen)) < 1e-2
+    values = [minimise(bowl, SPACE, 250, seed).best_value for seed in (3, 4)]
+    assert [value == study.best_value for value in values] == [True, False]
 
 
 def test_values_that_are_not_finite_are_bad_not_fatal():
-    assert minimise(lambda v: float('nan'), SPACE, 5).value == BAD
+    assert minimise(lambda v: float('nan'), SPACE, 5).best_value == BAD
 
 
 def test_missing_package_is_named(monkeypatch):

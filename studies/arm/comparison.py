@@ -61,7 +61,7 @@ def judged(robot: str, by_position: bool, duration: float, quick: bool) -> list[
             with np.errstate(all='ignore'):
                 return rmse(trained, peer(prepared[id(trained)], values))
 
-        best = minimise(error, space, 5 if quick else TRIALS[len(space)]).best
+        best = minimise(error, space, 5 if quick else TRIALS[len(space)]).best_params
         late = free.t > SETTLED
         size = np.sqrt(np.mean(peer(prepared[id(free)], best)[late] ** 2, axis=0))
         found: dict[str, Group] = {}

@@ -20,7 +20,10 @@ MAX_BITS = 1024
 
 TAG = 'tag:yaml.org,2002:'
 SCALARS = {TAG + name for name in ('null', 'bool', 'int', 'float', 'str')}
-TAGS = {yaml.SequenceStartEvent: {TAG + 'seq'}, yaml.MappingStartEvent: {TAG + 'map'}}
+TAGS: dict[type[yaml.Event], set[str]] = {
+    yaml.SequenceStartEvent: {TAG + 'seq'},
+    yaml.MappingStartEvent: {TAG + 'map'},
+}
 """Of what begins with such an event; all else is a scalar."""
 
 

@@ -1,15 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """How good an estimate is, in numbers."""
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
 Series = NDArray[np.float64]
 
 
-def rms(error: Series) -> float:
-    """Return the root mean square of a series; NaN for an empty one."""
-    return float(np.sqrt(np.mean(np.square(error)))) if len(error) else float('nan')
+def rms(error: Series) -> Any:
+    """Return the root mean square of a series, or of each column of a table; NaN if empty."""
+    return np.sqrt(np.mean(np.square(error), axis=0)) if len(error) else np.nan
 
 
 def chatter(estimate: Series, truth: Series) -> float:
@@ -39,4 +41,4 @@ def high_passed(x: Series, window: int) -> float:
     total = np.cumsum(np.concatenate([[0.0], x]))
     mean = (total[window:] - total[:-window]) / window
     half = window // 2
-    return rms(x[half : len(x) - half] - mean)
+    return float(rms(x[half : len(x) - half] - mean))

@@ -18,7 +18,7 @@ from fhaosmo_ros.tools.bags.reader import BagReader
 from fhaosmo_ros.tools.cli.command import output_at, run_command
 from fhaosmo_ros.tools.cli.options import add_value_options, assigned
 from fhaosmo_ros.tools.tuning import report
-from fhaosmo_ros.tools.tuning.identify import identify_input, make_gains
+from fhaosmo_ros.tools.tuning.identify import Identification
 from fhaosmo_ros.tools.tuning.linear_gains import chosen_otherwise
 from fhaosmo_ros.tools.tuning.objective import TUNE_PARAMETERS
 from fhaosmo_ros.tools.tuning.tuner import simulated, Tuner
@@ -83,8 +83,8 @@ def _tune(arguments: argparse.Namespace, stop: Stop) -> None:
                 print(f'{len(training)} recordings to train on, {len(held_out)} held out')
                 tuner = Tuner(training, held_out, estimator, values, arguments.seed)
             jobs = arguments.jobs or os.cpu_count() or 1
-            result = tuner.search(arguments.trials, jobs, arguments.storage, stop.is_set)
-            parameters, text = report.of_search(tuner, result)
+            study = tuner.search(arguments.trials, jobs, arguments.storage, stop.is_set)
+            parameters, text = report.of_search(tuner, study)
         report.save(folder, arguments.command_line, parameters, text)
     gains = arguments.output / 'gains.yaml'
     print(f'\n{text}\n\noutput: {gains}, report.md')
@@ -112,9 +112,8 @@ def _of_bag(
             samples = samples.unwrapped()
         u = inputs.at(samples)
     t = (samples.stamps - samples.stamps[0]) * 1e-9
-    found = identify_input((t, samples.values, u), model, values, given)
-    made = make_gains(found, given)
-    return report.of_bag(found, made, path.resolve().name)
+    found = Identification((t, samples.values, u), model, values, given)
+    return report.of_bag(found, path.resolve().name)
 
 
 def read_parameters(files: list[Path], rules: list[str]) -> tuple[dict[str, Any], dict[str, Any]]:

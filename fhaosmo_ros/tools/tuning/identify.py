@@ -1,32 +1,33 @@
 # SPDX-License-Identifier: Apache-2.0
 """From a recorded y to the likeliest model of d and of the noise (D 30), and to gains for them."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 import math
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
+from fhaosmo_ros.core.model.prediction import Prediction
 from fhaosmo_ros.core.model.triangular import TriangularModel
 from fhaosmo_ros.core.observer.configuration import usual_step
+from fhaosmo_ros.core.observer.kalman import innovations, LinearModel, matern, stationary
 from fhaosmo_ros.core.online.policy import GAP_SAMPLES
 from fhaosmo_ros.core.parameters.declaration import Parameters
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.tables import OBSERVER_PARAMETERS
 from fhaosmo_ros.core.simulation.metrics import rms
 from fhaosmo_ros.tools.cli.command import progress
-from fhaosmo_ros.tools.tuning.likelihood import CLIP, Design, Evaluation, Likelihood, Samples
 from fhaosmo_ros.tools.tuning.linear_gains import GAMMA, kalman_gains, rounded, SCHEME, WIDTH
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_opening
-from scipy.optimize import minimize
+from scipy.optimize import brentq, minimize
 from scipy.stats import chi2, median_abs_deviation
 
 Floats = NDArray[np.float64]
 Recorded = tuple[Floats, Floats, Floats]
-Evaluate = Callable[[Design], Evaluation]
 DERIVATIVES = (0, 1, 2, 3)
-FIRST = [Design(1, float(w), 0.5) for w in np.geomspace(2e-4, 2.0, 15)]
-"""Where the search begins: at the likeliest of these, with bandwidths in rad a sample."""
+FIRST = np.geomspace(2e-4, 2.0, 15)
+"""Bandwidths (rad a sample) of the filters at the likeliest of which the search begins."""
 SLOWEST, QUICKEST = 1e-5, 3.0
 """Bandwidths of the filters, in rad a sample."""
 STEPS = np.array([0.3, 0.5])
@@ -39,6 +40,12 @@ WORTH = 3.0
 OUTLIER, LONGEST_RUN = 6.0, 3
 """An outlier has an innovation of so many standard deviations; so many of them may follow."""
 MOST_OUTLIERS = 0.05
+CLIP = 3.0
+"""Standard deviations from which on an innovation counts linearly (Huber 1964)."""
+SETTLED = 8.0
+"""Time constants of the filter after which its covariance is steady."""
+LEAST_USED = 0.9
+"""Part of the samples that needs a finite innovation."""
 STILL = 0.03
 """Bandwidth of a filter that takes d for 0, over the bag's length."""
 LAGS = 20
@@ -58,32 +65,42 @@ BEGIN = 0.1
 """Part of the bag in which the estimates may still be settling."""
 
 
-class Identified(NamedTuple):
-    """What a recorded y shows."""
+class Samples(NamedTuple):
+    """A recorded y, of K samples."""
 
-    likelihood: Likelihood
-    best: Evaluation  # of the likeliest design
-    outliers: int  # samples that were left out
-    quantum: float  # of y; 0 for none that shows
+    h: Floats  # (K,) time since the sample before (s); 0 for the first one
+    periods: NDArray[np.int64]  # (K,) the same in sampling periods; 0: the filter begins afresh
+    y: Floats  # (K,)
+    u: Floats  # (K, m) known inputs of the interval that ends at each sample
+    used: NDArray[np.bool_]  # (K,) False for samples that do not correct: outliers
+
+
+class Design(NamedTuple):
+    """A model of d and of the noise, but for the size of both."""
+
+    derivatives: int  # k of D 17
+    bandwidth: float  # omega of the filter in rad/s, which says q (D 30)
+    ratio: float  # kappa / omega
 
     @property
-    def size_of_input(self) -> float:
-        """The RMS value D of the Matern process of d (D 17)."""
-        return self.likelihood.size_of_input(self.best.design, self.best.noise)
+    def decay(self) -> float:
+        """Rate kappa (1/s) of d."""
+        return self.ratio * self.bandwidth
 
 
-class Gains(NamedTuple):
-    """Parameters of the estimator, and what is to be expected if the model holds."""
+class Evaluation(NamedTuple):
+    """How well a design predicts y."""
 
-    parameters: dict[str, Any]
-    expected: Floats  # (n + 1,) standard deviations of the errors of z and d
+    design: Design
+    noise: float  # standard deviation of the noise of y: the likeliest one for this design
+    log_likelihood: float  # of all samples that are used; -inf for a filter that diverges
+    innovations: Floats  # (K,) over their expected standard deviations; NaN where there is none
+    estimates: Floats  # (K, N)
 
 
-def identify_input(
-    recorded: Recorded, model: TriangularModel, values: Parameters, given: Mapping[str, Any]
-) -> Identified:
+class Identification:
     """
-    Find the likeliest noise and model of d.
+    The likeliest noise and model of d of a recorded y.
 
     Parameters
     ----------
@@ -96,155 +113,267 @@ def identify_input(
         Those of them that the user set: `noise_size`, `unknown_input_derivatives` and
         `unknown_input_decay` are not estimated then.
 
+    Attributes
+    ----------
+    samples : Samples
+        Those that are usable.
+    period : float
+        Of sampling (s).
+    quantum : float
+        Of y; 0 for none that shows.
+    fixed : bool
+        The noise is given.
+    outliers : int
+        Samples that were left out.
+    best : Evaluation
+        Of the likeliest design.
+
     Raises
     ------
     ConfigurationError
         There are no gains for this y; the text says why.
 
     """
-    likelihood = _prepared(recorded, model, values, given)
-    decay, tried = given.get('unknown_input_decay') or None, DERIVATIVES
-    if 'unknown_input_derivatives' in given:
-        tried = (given['unknown_input_derivatives'],)
-    with progress(unit='filter', desc='likelihood', leave=False) as bar:
 
-        def evaluate(design: Design) -> Evaluation:
-            bar.update()
-            return likelihood(design)
+    def __init__(
+        self,
+        recorded: Recorded,
+        model: TriangularModel,
+        values: Parameters,
+        given: Mapping[str, Any],
+    ) -> None:
+        t, y, u = usable(*recorded)
+        count, different = len(y), len(np.unique(y))
+        if count < FEWEST:
+            raise ConfigurationError(f'y: expected at least {FEWEST} samples, got {count}')
+        if different < 5 or np.ptp(y) <= 1e-12 * np.abs(y).max():
+            raise ConfigurationError(
+                f'y: expected a signal that moves, got {count} samples with {different} different '
+                f'values ({y.min():.6g} to {y.max():.6g}): it is constant, or stuck, and nothing '
+                'can be learned from it. Record while the plant moves'
+            )
+        h = np.diff(t, prepend=t[0])
+        self.model, self._given = model, given
+        self.period = period = float(np.median(h[1:]))
+        periods = np.maximum(np.round(h / period), 1.0).astype(np.int64)
+        periods[h > max(values['max_gap'] or GAP_SAMPLES * period, 3.0 * period)] = periods[0] = 0
+        used = np.ones(count, dtype=bool)
+        self.samples = Samples(h, periods, y, np.ascontiguousarray(u), used)
+        self._longest = values['prediction_step'] or usual_step(model)
+        self._jacobian = model.jacobian(np.zeros(model.order))
+        # How far off z_1 .. z_n may be where the filter begins: a first guess.
+        block = max(count // 300, 1)
+        slow = y[: count // block * block].reshape(-1, block).mean(axis=1)
+        sizes = [rms(slow)]
+        for _ in range(1, model.order):
+            slow = np.diff(slow) / (block * period)
+            sizes.append(3.0 * rms(slow))
+        self._sizes = np.array(sizes)
+        # The noise: a smooth signal vanishes in differences of high order.
+        self.quantum = quantum(y)
+        self._rounding = self.quantum / math.sqrt(12.0)
+        rough = float(median_abs_deviation(np.diff(y, 4), scale='normal')) / math.sqrt(70.0)
+        self.fixed = bool(given.get('noise_size'))
+        self._noise = max(rough, self._rounding, 1e-9 * float(np.std(y)))
+        if self.fixed:
+            self._noise = given['noise_size']
+        self._clip = math.inf  # standard deviations, of the innovations by which it corrects
+        with progress(unit='filter', desc='likelihood', leave=False) as self._bar:
+            start = self._start()
+            self.outliers = self._leave_out_outliers(start)
+            tried: tuple[int, ...] = DERIVATIVES
+            if 'unknown_input_derivatives' in given:
+                tried = (given['unknown_input_derivatives'],)
+            self.best, *others = [self._fit(start.design._replace(derivatives=k)) for k in tried]
+            for richer in others:
+                if richer.log_likelihood > self.best.log_likelihood + WORTH:
+                    self.best = richer
+            self._refuse()
 
-        start = _start(likelihood, evaluate)
-        outliers = _leave_out_outliers(likelihood, start)
-        designs = [start.design._replace(derivatives=k) for k in tried]
-        best, *others = [_fit(evaluate, d, likelihood.period, decay) for d in designs]
-        for richer in others:
-            if richer.log_likelihood > best.log_likelihood + WORTH:
-                best = richer
-        still = STILL / float(likelihood.samples.h.sum())
-        without = evaluate(best.design._replace(bandwidth=still))
-    found = Identified(likelihood, best, outliers, quantum(likelihood.samples.y))
-    _refuse(found, best.log_likelihood - without.log_likelihood)
-    return found
+    def intensity(self, design: Design, noise: float) -> float:
+        """Return q of the white noise that drives the last derivative of d."""
+        levels = self.model.order + 1 + design.derivatives
+        return noise**2 * self.period * design.bandwidth ** (2 * levels)
 
+    def size_of_input(self, design: Design, noise: float) -> float:
+        """Return the RMS value D of the Matern process of d (D 17)."""
+        of_unit = matern(design.decay, design.derivatives)
+        return math.sqrt(self.intensity(design, noise) / of_unit)
 
-def _refuse(found: Identified, fall: float) -> None:
-    """Raise where there are no gains; `fall`: of the log-likelihood if d were 0."""
-    likelihood, y, noise = found.likelihood, found.likelihood.samples.y, found.best.noise
-    period, bandwidth = likelihood.period, found.best.design.bandwidth
-    if not math.isfinite(found.best.log_likelihood):
-        raise ConfigurationError(
-            f'y: expected samples that the model can predict, got none that phi = '
-            f'{list(likelihood.model.phi)} follows: its estimates leave the finite numbers'
+    def evaluate(self, design: Design) -> Evaluation:
+        """Return how likely y is by a design."""
+        self._bar.update()
+        expressions = self.model.with_unknown_input(design.decay, design.derivatives)
+        prediction = Prediction(expressions, self._longest)
+        b, s, x = innovations(prediction, self.samples, self._linear(design))
+        with np.errstate(invalid='ignore', over='ignore'):  # of a filter that diverges
+            s /= self._noise**2
+            r = b / np.sqrt(s)
+            used, counted = self.samples.used, np.isfinite(r) & self.samples.used
+            if not counted.sum() > LEAST_USED * used.sum():
+                return Evaluation(design, math.nan, -math.inf, r, x)
+            noise = self._noise
+            if not self.fixed:  # an encoder's steps make at least that of their rounding
+                noise = max(likeliest_scale(r[counted]), self._rounding)
+            size = np.abs(r[counted]) / noise
+            loss = np.where(size <= CLIP, size**2, 2.0 * CLIP * size - CLIP**2)
+            mean = -0.5 * float(np.mean(loss + np.log(s[counted]))) - math.log(noise)
+            return Evaluation(design, noise, mean * int(used.sum()), r / noise, x)
+
+    def _linear(self, design: Design) -> SimpleNamespace:
+        """Return the linear model of a period, of N states: z, d and its derivatives."""
+        n, noise = self.model.order, self._noise**2
+        size, q = n + 1 + design.derivatives, self.intensity(design, self._noise)
+        rates = np.eye(size, k=1)
+        rates[:n, :n] += self._jacobian
+        rates[range(n, size), range(n, size)] = -design.decay
+        a, added = LinearModel(rates, q).transition(self.period)
+        fresh = np.zeros((size, size))
+        fresh[range(1, n), range(1, n)] = np.square(self._sizes[1:])
+        fresh[n:, n:] = stationary(rates[n:, n:], q)
+        fresh[0, 0] = noise  # the filter begins with z_1 = y
+        settled = int(min(SETTLED / (design.bandwidth * self.period), 2.0**40))
+        return SimpleNamespace(
+            a=a, q=added, fresh=fresh, variance=noise, clip=self._clip, settled=settled
         )
-    silent = noise < NO_NOISE * float(np.std(y)) and not found.quantum
-    if (silent or bandwidth > 0.9 * QUICKEST / period) and not likelihood.fixed:
-        raise ConfigurationError(
-            f'y: expected noise, got none that shows ({noise:.1e} in a y of {np.std(y):.3g}; the '
-            f'likeliest filter has {bandwidth:.3g} rad/s at {1.0 / period:.4g} Hz). The '
-            'less noise, the larger the gains, without limit: say what the sensor will have (-p '
-            'noise_size:=...). Or y moves in a way that the model cannot: it jumps, or order or '
-            'phi are wrong; then correct the model, or sample faster'
-        )
-    if fall < SURE:
-        raise ConfigurationError(
-            f'd: expected a y that d moves, got one that the model explains with d = 0 (noise '
-            f'{noise:.3g}). Record while the unknown input acts, and longer'
-        )
 
+    def _start(self) -> Evaluation:
+        """Scan bandwidths, and bring the scale of clipping and the sizes about."""
+        designs = [Design(1, float(w) / self.period, 0.5) for w in FIRST]
+        best = max(map(self.evaluate, designs), key=lambda e: e.log_likelihood)
+        self._clip = CLIP
+        for _ in range(2):
+            if math.isfinite(best.log_likelihood):
+                self._noise = best.noise
+                sizes = np.sqrt(np.nanmean(best.estimates[:, : self.model.order] ** 2, axis=0))
+                self._sizes = np.where(np.isfinite(sizes), sizes, self._sizes)
+            best = self.evaluate(best.design)
+        return best
 
-def make_gains(found: Identified, given: Mapping[str, Any]) -> Gains:
-    """
-    Return the gains of the steady Kalman filter of what was found (D 17 to D 19).
+    def _leave_out_outliers(self, start: Evaluation) -> int:
+        """Mark lonely samples that no other sample supports; return their number."""
+        size = np.abs(np.nan_to_num(start.innovations))
+        # Innovations of a first, coarse fit are not normal: their own median says what is usual.
+        far = size > OUTLIER * max(float(np.median(size)) / 0.6745, 1.0)
+        far &= ~binary_opening(far, np.ones(LONGEST_RUN + 1))  # which keeps longer runs
+        if far.mean() > MOST_OUTLIERS:
+            return 0
+        self.samples.used[far] = False
+        return int(far.sum())
 
-    Raises
-    ------
-    ConfigurationError
-        The estimate of d would tell nothing, or there is no such filter in floating-point numbers.
+    def _fit(self, design: Design) -> Evaluation:
+        """Return the likeliest design around this one (Nelder and Mead 1965)."""
+        decay = self._given.get('unknown_input_decay')
 
-    """
-    likelihood, design = found.likelihood, found.best.design
-    order, period = likelihood.model.order, rounded(likelihood.period)
-    noise, begin = rounded(found.best.noise), int(BEGIN * len(likelihood.samples.y))
-    states = found.best.estimates[begin:, :order]
-    sizes = np.maximum(np.sqrt(np.nanmean(np.square(states), axis=0)), noise)
-    values = {
-        **SCHEME,
-        'correction_period': period,
-        'noise_size': noise,
-        'state_sizes': [rounded(x) for x in sizes],
-        'unknown_input_size': rounded(found.size_of_input),
-        'unknown_input_derivatives': design.derivatives,
-        'unknown_input_decay': rounded(design.decay),
-        'fuzzy_widths': [rounded(WIDTH * noise)],
-        'gamma_initial': GAMMA,
-        **given,
-    }
-    checked = OBSERVER_PARAMETERS.complete(OBSERVER_PARAMETERS.part_of(values))
-    lambdas, k, p, variance = kalman_gains(checked, period)
-    values['lambda'] = [rounded(x) for x in lambdas]
-    errors = np.sqrt(np.maximum(np.diag(p) - k**2 * variance, 0.0))
-    share = errors[order] / found.size_of_input
-    if share > UNSEEN:
-        raise ConfigurationError(
-            f'd: it changes too fast to be seen through this noise: the expected error is '
-            f'{min(share, 1.0):.2f} of its size, and an estimate of 0 has 1.00. Does y drift or '
-            'jump by itself, is its noise correlated from sample to sample (`gains: self_tuning` '
-            f'follows that), or is the order ({order}) too high by one? Else a '
-            'sensor with less noise, or a higher rate, is needed'
-        )
-    return Gains(values, errors[: order + 1])
+        def at(point: Floats) -> Evaluation:
+            """Evaluate at ln bandwidth (rad a sample) and, unless decay is given, ln ratio."""
+            bandwidth = math.exp(point[0]) / self.period
+            ratio = decay / bandwidth if decay else math.exp(point[1])
+            return self.evaluate(design._replace(bandwidth=bandwidth, ratio=ratio))
 
+        count = 1 if decay else 2
+        start = np.log([design.bandwidth * self.period, design.ratio])[:count]
+        found = minimize(
+            lambda point: min(-at(point).log_likelihood, 1e300), start, method='Nelder-Mead',
+            bounds=BOUNDS[:count],
+            options={
+                'initial_simplex': np.vstack([start, start + np.diag(STEPS[:count])]),
+                'xatol': 0.02, 'fatol': 0.1, 'maxfev': EVALUATIONS,
+            },
+        )  # fmt: skip
+        return at(found.x)
 
-def whiteness(found: Identified) -> tuple[float, float]:
-    """
-    Return the largest autocorrelation of the innovations within `LAGS` samples, and a probability.
+    def _refuse(self) -> None:
+        """Raise where there are no gains."""
+        y, noise, period = self.samples.y, self.best.noise, self.period
+        if not math.isfinite(self.best.log_likelihood):
+            raise ConfigurationError(
+                f'y: expected samples that the model can predict, got none that phi = '
+                f'{list(self.model.phi)} follows: its estimates leave the finite numbers'
+            )
+        silent, bandwidth = noise < NO_NOISE * np.std(y), self.best.design.bandwidth
+        quick = bandwidth > 0.9 * QUICKEST / period
+        if (quick or (silent and not self.quantum)) and not self.fixed:
+            raise ConfigurationError(
+                f'y: expected noise, got none that shows ({noise:.1e} in a y of {np.std(y):.3g}; '
+                f'the likeliest filter has {bandwidth:.3g} rad/s at {1.0 / period:.4g} Hz). The '
+                'less noise, the larger the gains, without limit: say what the sensor will have '
+                '(-p noise_size:=...). Or y moves in a way that the model cannot: it jumps, or '
+                'order or phi are wrong; then correct the model, or sample faster'
+            )
+        still = STILL / float(self.samples.h.sum())
+        without = self.evaluate(self.best.design._replace(bandwidth=still))
+        if self.best.log_likelihood - without.log_likelihood < SURE:
+            raise ConfigurationError(
+                f'd: expected a y that d moves, got one that the model explains with d = 0 (noise '
+                f'{noise:.3g}). Record while the unknown input acts, and longer'
+            )
 
-    It is that of such correlations, were innovations white (Ljung and Box 1978).
-    """
-    begin = int(BEGIN * len(found.best.innovations))
-    r = found.best.innovations[begin:]
-    r = np.clip(r[np.isfinite(r) & found.likelihood.samples.used[begin:]], -CLIP, CLIP)
-    r = r - r.mean()
-    count, lags = len(r), np.arange(1, LAGS + 1)
-    correlations = np.array([r[:-j] @ r[j:] for j in lags]) / (r @ r)
-    statistic = count * (count + 2.0) * np.sum(correlations**2 / (count - lags))
-    largest = correlations[np.abs(correlations).argmax()]
-    return float(largest), float(chi2.sf(statistic, LAGS))
+    def whiteness(self) -> tuple[float, float]:
+        """
+        Return the largest autocorrelation of innovations within `LAGS` samples, and a probability.
 
+        It is that of such correlations, were innovations white (Ljung and Box 1978).
+        """
+        begin = int(BEGIN * len(self.samples.y))
+        r = self.best.innovations[begin:]
+        r = np.clip(r[np.isfinite(r) & self.samples.used[begin:]], -CLIP, CLIP)
+        r = r - r.mean()
+        count, lags = len(r), np.arange(1, LAGS + 1)
+        correlations = np.array([r[:-j] @ r[j:] for j in lags]) / (r @ r)
+        statistic = count * (count + 2.0) * np.sum(correlations**2 / (count - lags))
+        largest = correlations[np.abs(correlations).argmax()]
+        return float(largest), float(chi2.sf(statistic, LAGS))
 
-def _prepared(
-    recorded: Recorded, model: TriangularModel, values: Parameters, given: Mapping[str, Any]
-) -> Likelihood:
-    """Return the likelihood of the usable samples, with a first guess of noise and states."""
-    t, y, u = usable(*recorded)
-    count, different = len(y), len(np.unique(y))
-    if count < FEWEST:
-        raise ConfigurationError(f'y: expected at least {FEWEST} samples, got {count}')
-    if different < 5 or np.ptp(y) <= 1e-12 * np.abs(y).max():
-        raise ConfigurationError(
-            f'y: expected a signal that moves, got {count} samples with {different} different '
-            f'values ({y.min():.6g} to {y.max():.6g}): it is constant, or stuck, and nothing can '
-            'be learned from it. Record while the plant moves'
-        )
-    h = np.diff(t, prepend=t[0])
-    period = float(np.median(h[1:]))
-    periods = np.maximum(np.round(h / period), 1.0).astype(np.int64)
-    periods[h > max(values['max_gap'] or GAP_SAMPLES * period, 3.0 * period)] = periods[0] = 0
-    samples = Samples(h, periods, y, np.ascontiguousarray(u), np.ones(count, dtype=bool))
-    block = max(count // 300, 1)
-    slow = y[: count // block * block].reshape(-1, block).mean(axis=1)
-    sizes = [rms(slow)]
-    for _ in range(1, model.order):
-        slow = np.diff(slow) / (block * period)
-        sizes.append(3.0 * rms(slow))
-    rounding = quantum(y) / math.sqrt(12.0)
-    # A smooth signal vanishes in differences of high order.
-    rough = median_abs_deviation(np.diff(y, 4), scale='normal') / math.sqrt(70.0)
-    noise = max(float(rough), rounding, 1e-9 * float(np.std(y)))
-    known = given.get('noise_size')
-    return Likelihood(
-        model, period, samples, np.array(sizes), known or noise, fixed=bool(known),
-        longest=values['prediction_step'] or usual_step(model), least_noise=rounding,
-    )  # fmt: skip
+    def gains(self) -> tuple[dict[str, Any], Floats]:
+        """
+        Return the gains of the steady Kalman filter of what was found (D 17 to D 19).
+
+        Returns
+        -------
+        dict
+            Parameters of the estimator.
+        (n + 1,) array
+            Standard deviations of the errors of z and d that are to be expected.
+
+        Raises
+        ------
+        ConfigurationError
+            The estimate of d would tell nothing, or there is no such filter in floating-point
+            numbers.
+
+        """
+        best, order, period = self.best, self.model.order, rounded(self.period)
+        noise, begin = rounded(best.noise), int(BEGIN * len(self.samples.y))
+        of_d = self.size_of_input(best.design, best.noise)
+        states = best.estimates[begin:, :order]
+        sizes = np.maximum(np.sqrt(np.nanmean(np.square(states), axis=0)), noise)
+        values = {
+            **SCHEME,
+            'correction_period': period,
+            'noise_size': noise,
+            'state_sizes': [rounded(x) for x in sizes],
+            'unknown_input_size': rounded(of_d),
+            'unknown_input_derivatives': best.design.derivatives,
+            'unknown_input_decay': rounded(best.design.decay),
+            'fuzzy_widths': [rounded(WIDTH * noise)],
+            'gamma_initial': GAMMA,
+            **self._given,
+        }
+        checked = OBSERVER_PARAMETERS.complete(OBSERVER_PARAMETERS.part_of(values))
+        lambdas, k, p, variance = kalman_gains(checked, period)
+        values['lambda'] = [rounded(x) for x in lambdas]
+        errors = np.sqrt(np.maximum(np.diag(p) - k**2 * variance, 0.0))
+        share = errors[order] / of_d
+        if share > UNSEEN:
+            raise ConfigurationError(
+                f'd: it changes too fast to be seen through this noise: the expected error is '
+                f'{min(share, 1.0):.2f} of its size, and an estimate of 0 has 1.00. Does y drift '
+                'or jump by itself, is its noise correlated from sample to sample (`gains: '
+                f'self_tuning` follows that), or is the order ({order}) too high by one? Else a '
+                'sensor with less noise, or a higher rate, is needed'
+            )
+        return values, errors[: order + 1]
 
 
 def usable(t: Floats, y: Floats, u: Floats) -> Recorded:
@@ -268,50 +397,15 @@ def quantum(y: Floats) -> float:
     return float(np.sum(steps) / np.sum(whole)) if few and near.mean() >= 0.99 else 0.0
 
 
-def _leave_out_outliers(likelihood: Likelihood, start: Evaluation) -> int:
-    """Mark lonely samples that no other sample supports; return their number."""
-    size = np.abs(np.nan_to_num(start.innovations))
-    # Innovations of a first, coarse fit are not normal: their own median says what is usual.
-    far = size > OUTLIER * max(float(np.median(size)) / 0.6745, 1.0)
-    far &= ~binary_opening(far, np.ones(LONGEST_RUN + 1))  # which keeps longer runs
-    if far.mean() > MOST_OUTLIERS:
-        return 0
-    likelihood.samples.used[far] = False
-    return int(far.sum())
+def likeliest_scale(r: Floats) -> float:
+    """Return the likeliest standard deviation of numbers under Huber's loss."""
+    size = np.abs(r)
+    mean = float(size.mean())
+    if not 0.0 < mean < math.inf:
+        return max(mean, math.ulp(0.0) ** 0.5)
 
+    def excess(scale: float) -> float:
+        """Return what falls with the scale, and is 0 at the likeliest one."""
+        return float(np.mean(np.minimum((size / scale) ** 2, CLIP * size / scale))) - 1.0
 
-def _start(likelihood: Likelihood, evaluate: Evaluate) -> Evaluation:
-    """Scan bandwidths, and bring the scale of clipping and the sizes about."""
-    designs = (d._replace(bandwidth=d.bandwidth / likelihood.period) for d in FIRST)
-    best = max(map(evaluate, designs), key=lambda e: e.log_likelihood)
-    likelihood.clip = CLIP
-    for _ in range(2):
-        if math.isfinite(best.log_likelihood):
-            likelihood.noise = best.noise
-            states = best.estimates[:, : len(likelihood.sizes)]
-            sizes = np.sqrt(np.nanmean(states**2, axis=0))
-            likelihood.sizes = np.where(np.isfinite(sizes), sizes, likelihood.sizes)
-        best = evaluate(best.design)
-    return best
-
-
-def _fit(evaluate: Evaluate, design: Design, period: float, decay: float | None) -> Evaluation:
-    """Return the likeliest design around this one (Nelder and Mead 1965)."""
-
-    def at(point: Floats) -> Evaluation:
-        """Evaluate at ln bandwidth (rad a sample) and, unless decay is given, ln ratio."""
-        bandwidth = math.exp(point[0]) / period
-        ratio = decay / bandwidth if decay else math.exp(point[1])
-        return evaluate(design._replace(bandwidth=bandwidth, ratio=ratio))
-
-    count = 1 if decay else 2
-    start = np.log([design.bandwidth * period, design.ratio])[:count]
-    found = minimize(
-        lambda point: min(-at(point).log_likelihood, 1e300), start, method='Nelder-Mead',
-        bounds=BOUNDS[:count],
-        options={
-            'initial_simplex': np.vstack([start, start + np.diag(STEPS[:count])]),
-            'xatol': 0.02, 'fatol': 0.1, 'maxfev': EVALUATIONS,
-        },
-    )  # fmt: skip
-    return at(found.x)
+    return float(brentq(excess, 0.8 * mean, 1.01 * CLIP * mean, xtol=1e-300, rtol=1e-10))

@@ -2,12 +2,13 @@
 """What a set of gains is worth: its errors as one number; and the parameters of `tune` itself."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.parameters.declaration import Parameter, ParameterTable
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.tables import MODEL, ONLINE_PARAMETERS
+from fhaosmo_ros.core.simulation.metrics import rms
 from fhaosmo_ros.core.simulation.recordings import FAMILY, Recording, SENSOR, SHARED
 import numpy as np
 from numpy.typing import NDArray
@@ -19,38 +20,20 @@ SMALLEST = 1e-12
 """Relative errors below this one count as this one, so that their logarithm is finite."""
 
 TUNING = (
-    Parameter(
-        'recordings', 36, 'Number of recordings that the search sees.', lower=1, upper=10_000,
-        live=False,
-    ),
-    Parameter(
-        'held_out', 36, 'Number of other recordings, with other seeds, that only the report sees.',
-        lower=1, upper=10_000, live=False,
-    ),
-    Parameter(
-        'settled', 5.0, 'Errors count from this time of a recording on.', unit='s',
-        lower=0.0, upper=1e5, live=False,
-    ),
-    Parameter(
-        'weights', [1.0],
-        'Weight of the error of each estimate, squared and relative to the RMS of its truth.',
-        lower=0.0, upper=1e9, live=False, lengths='1 (d alone) or n + 1 (z1 .. zn, d)',
-    ),
+    Parameter('recordings', 36, 'Number of recordings that the search sees.', lower=1,
+              upper=10_000, live=False),
+    Parameter('held_out', 36,
+              'Number of other recordings, with other seeds, that only the report sees.', lower=1,
+              upper=10_000, live=False),
+    Parameter('settled', 5.0, 'Errors count from this time of a recording on.', unit='s',
+              lower=0.0, upper=1e5, live=False),
+    Parameter('weights', [1.0],
+              'Weight of the error of each estimate, squared and relative to the RMS of its '
+              'truth.', lower=0.0, upper=1e9, live=False,
+              lengths='1 (d alone) or n + 1 (z1 .. zn, d)'),
 )  # fmt: skip
 TUNE_PARAMETERS = ParameterTable(MODEL, SENSOR, SHARED, FAMILY, TUNING)
 """All that `tune` takes beside the estimator's parameters."""
-
-
-class Evaluation(NamedTuple):
-    """How good one set of parameters is."""
-
-    error: float
-    """
-    Weighted RMS error relative to the RMS of the truth; geometric mean over the recordings, so
-    that an error smaller by a tenth counts the same on an easy recording and on a hard one.
-    """
-    errors: Floats
-    """(R, n + 1) RMS errors of z_1 .. z_n and d of each recording."""
 
 
 class Objective:
@@ -79,26 +62,34 @@ class Objective:
         tuning: Mapping[str, Any],
         scale: Floats | None = None,
     ) -> None:
-        self.recordings, self._tuning = list(recordings), tuning
-        settled, shortest = tuning['settled'], min(r.t[-1] - r.t[0] for r in recordings)
-        if shortest <= settled:
+        self.recordings, self._settled = recordings, tuning['settled']
+        shortest = min(r.t[-1] - r.t[0] for r in recordings)
+        if shortest <= self._settled:
             raise ConfigurationError(
-                f'recording: expected more than {settled:g} s (settled), got {shortest:g} s'
+                f'recording: expected more than {self._settled:g} s (settled), got {shortest:g} s'
             )
-        late = [np.column_stack([r.z, r.d])[r.t - r.t[0] >= settled] for r in recordings]
-        self.scale = _rms(np.concatenate(late)) if scale is None else scale
-        weights, count = np.array(tuning['weights']), len(self.scale)
-        if len(weights) == 1:
-            weights = np.append(np.zeros(count - 1), weights)
-        if len(weights) != count or not weights.sum() > 0.0:
+        late = [np.column_stack([r.z, r.d])[r.t - r.t[0] >= self._settled] for r in recordings]
+        self.scale = rms(np.concatenate(late)) if scale is None else scale
+        weights, count = tuning['weights'], len(self.scale)
+        if len(weights) not in (1, count) or not sum(weights) > 0.0:
             raise TUNE_PARAMETERS['weights'].error(
-                tuning['weights'], f'1 or {count} numbers, not all of them 0'
+                weights, f'1 or {count} numbers, not all of them 0'
             )
-        self._weights = weights / weights.sum()
+        self._weights = np.zeros(count)
+        self._weights[-len(weights) :] = np.array(weights) / sum(weights)
 
-    def __call__(self, parameters: Mapping[str, Any]) -> Evaluation:
+    def __call__(self, parameters: Mapping[str, Any]) -> tuple[float, Floats]:
         """
         Evaluate parameters of the estimator.
+
+        Returns
+        -------
+        float
+            Weighted RMS error relative to the RMS of the truth; geometric mean over the
+            recordings, so that an error smaller by a tenth counts the same on an easy recording
+            and on a hard one.
+        (R, n + 1) array
+            RMS errors of z_1 .. z_n and d of each recording.
 
         Raises
         ------
@@ -117,8 +108,7 @@ class Objective:
         with np.errstate(over='ignore', divide='ignore'):  # of a truth that is 0 throughout
             relative = np.square(errors[:, used] / self.scale[used])
         each = np.sqrt(relative @ self._weights[used])
-        error = float(np.exp(np.mean(np.log(np.maximum(each, SMALLEST)))))
-        return Evaluation(error, errors)
+        return float(np.exp(np.mean(np.log(np.maximum(each, SMALLEST))))), errors
 
     def _judge(self, estimator: OnlineEstimator, r: Recording) -> Floats:
         """Return the errors of z and d."""
@@ -126,10 +116,10 @@ class Objective:
         u = r.u if estimator.observer.used_inputs else None
         found = estimator.run(stamps_of(r.t - r.t[0]), r.y, u)
         t = r.t[0] + (found.t - FIRST_STAMP) * 1e-9  # before the sample's, if that is delayed
-        late = t - r.t[0] >= self._tuning['settled']
+        late = t - r.t[0] >= self._settled
         truth = np.column_stack([np.interp(t[late], r.t, x) for x in (*r.z.T, r.d)])
         with np.errstate(over='ignore', invalid='ignore'):
-            errors = _rms(np.column_stack([found.z, found.unknown_input])[late] - truth)
+            errors = rms(np.column_stack([found.z, found.unknown_input])[late] - truth)
         # An estimate that is not finite is infinitely wrong, not undefined.
         return np.nan_to_num(errors, nan=np.inf)
 
@@ -137,8 +127,3 @@ class Objective:
 def stamps_of(t: Floats) -> NDArray[np.int64]:
     """Return stamps (ns) for times since the first sample."""
     return FIRST_STAMP + np.round(t * 1e9).astype(np.int64)
-
-
-def _rms(x: Floats) -> Floats:
-    """Return the RMS value of each column."""
-    return np.asarray(np.sqrt(np.mean(np.square(x), axis=0)))

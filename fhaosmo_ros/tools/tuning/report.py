@@ -9,8 +9,9 @@ from typing import Any
 from fhaosmo_ros import __version__
 from fhaosmo_ros.core.parameters.files import dumps
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
-from fhaosmo_ros.tools.tuning.identify import Gains, Identified, SURE, whiteness
-from fhaosmo_ros.tools.tuning.search import Result
+from fhaosmo_ros.core.simulation.metrics import rms
+from fhaosmo_ros.tools.tuning.identify import Identification, SURE
+from fhaosmo_ros.tools.tuning.search import finished
 from fhaosmo_ros.tools.tuning.tuner import Tuner
 import numpy as np
 
@@ -32,52 +33,52 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     return '\n'.join(f'| {" | ".join(cells)} |' for cells in lines)
 
 
-def of_search(tuner: Tuner, result: Result) -> tuple[dict[str, Any], str]:
+def of_search(tuner: Tuner, study: Any) -> tuple[dict[str, Any], str]:
     """Return the gains for a simulated family, and a report of them."""
-    best, begin = result.best, {d.name: d.start for d in tuner.space}
-    columns, found = [''], []
-    for title, values in (('start', begin), ('tuned', best)):
+    tuned, columns, found = tuner.parameters(study.best_params), [''], []
+    start = tuner.parameters({d.name: d.start for d in tuner.space})
+    for title, parameters in (('start', start), ('tuned', tuned)):
         for data, objective in (('training', tuner.training), ('held out', tuner.held_out)):
             columns.append(f'{title}, {data}')
-            found.append(objective(tuner.parameters(values)))
-    errors = np.sqrt([np.mean(np.square(e.errors), axis=0) for e in found]).T
-    names = [*(f'z{k}' for k in range(1, len(errors))), 'd']
-    rows = [['error, relative to the truth', *(f'{e.error:.4f}' for e in found)]]
-    for name, of_name in zip(names, errors, strict=True):
+            found.append(objective(parameters))
+    rows = [['error, relative to the truth', *(f'{error:.4f}' for error, _ in found)]]
+    names = [*(f'z{k}' for k in range(1, len(tuner.training.scale))), 'd']
+    for name, of_name in zip(names, zip(*(rms(e) for _, e in found), strict=True), strict=True):
         rows.append([f'RMS error of {name}', *(f'{error:.3g}' for error in of_name)])
     text = '\n\n'.join([
-        f'{result.trials} trials on {len(tuner.training.recordings)} simulated recordings; '
+        f'{finished(study)} trials on {len(tuner.training.recordings)} simulated recordings; '
         f'{len(tuner.held_out.recordings)} others, held out, took no part in the search.',
         table(columns, rows),
     ])  # fmt: skip
-    return tuner.parameters(best), text
+    return tuned, text
 
 
-def of_bag(found: Identified, gains: Gains, bag: str) -> tuple[dict[str, Any], str]:
+def of_bag(found: Identification, bag: str) -> tuple[dict[str, Any], str]:
     """Return the gains for what the y of a bag shows, and a report of them."""
-    likelihood, best, size = found.likelihood, found.best, found.size_of_input
-    span, white = likelihood.samples.h.sum(), whiteness(found)
+    best, (parameters, expected) = found.best, found.gains()
+    size, white = found.size_of_input(best.design, best.noise), found.whiteness()
+    span = found.samples.h.sum()
     rows = [
-        (f'samples in {bag}', f'{len(likelihood.samples.y)} in {span:.1f} s'),
-        ('noise of y (standard deviation)', f'{best.noise:.4g}' + ' (given)' * likelihood.fixed),
+        (f'samples in {bag}', f'{len(found.samples.y)} in {span:.1f} s'),
+        ('noise of y (standard deviation)', f'{best.noise:.4g}' + ' (given)' * found.fixed),
         ('size of d (RMS)', f'{size:.4g}'),
         ('time in which d changes (1/kappa), s', f'{1.0 / best.design.decay:.4g}'),
         ('derivatives of d that are followed', f'{best.design.derivatives}'),
     ]
-    for i, error in enumerate(gains.expected[:-1], 1):
+    for i, error in enumerate(expected[:-1], 1):
         rows.append((f'expected error of z{i}', f'{error:.3g}'))
-    share = gains.expected[-1] / size
-    rows.append(('expected error of d', f'{gains.expected[-1]:.3g} ({share:.2f} of its size)'))
+    share = expected[-1] / size
+    rows.append(('expected error of d', f'{expected[-1]:.3g} ({share:.2f} of its size)'))
     rows.append(('probability that innovations are white (Ljung-Box)', f'{white[1]:.2g}'))
     told = [f'Note: {text}' for text in notes(found, *white)]
     text = '\n\n'.join([table(['found in y', ''], rows), *told])
-    return ESTIMATOR_PARAMETERS.part_of(gains.parameters), text
+    return ESTIMATOR_PARAMETERS.part_of(parameters), text
 
 
-def notes(found: Identified, correlation: float, probability: float) -> Iterator[str]:
+def notes(found: Identification, correlation: float, probability: float) -> Iterator[str]:
     """Say what a user should know before trusting the gains."""
-    best, samples = found.best, found.likelihood.samples
-    if found.quantum > 2.0 * best.noise:
+    samples, model, whole = found.samples, found.model, float(found.samples.h.sum())
+    if found.quantum > 2.0 * found.best.noise:
         yield (
             f'y comes in steps of {found.quantum:.3g}, larger than its noise: the '
             'error of the steps is not random. docs/recipes.md says what helps.'
@@ -87,9 +88,7 @@ def notes(found: Identified, correlation: float, probability: float) -> Iterator
             f'{found.outliers} samples ({found.outliers / len(samples.y):.2%}) are outliers. They '
             'were left out; the estimator rejects such samples, too.'
         )
-    model, whole = found.likelihood.model, float(samples.h.sum())
-    n = model.order
-    rates = model.jacobian(np.zeros(n)) + np.eye(n, k=1)
+    rates = model.jacobian(np.zeros(model.order)) + np.eye(model.order, k=1)
     growth = float(np.linalg.eigvals(rates).real.max())
     if growth * whole > SURE:
         yield (

@@ -31,14 +31,6 @@ class Dimension(NamedTuple):
     log: bool = True  # search in its logarithm
 
 
-class Result(NamedTuple):
-    """The outcome of a search."""
-
-    best: Values  # by name
-    value: float  # the objective there
-    trials: int  # finished ones of the study, also those of other processes
-
-
 def minimise(
     objective: Callable[[Values], float],
     space: Sequence[Dimension],
@@ -46,12 +38,12 @@ def minimise(
     seed: int = 1,
     *,
     storage: str | None = None,
-    name: str = 'study',
+    name: str | None = None,
     jobs: int = 1,
     on_trial: Callable[[], object] = lambda: None,
-) -> Result:
+) -> Any:
     """
-    Minimise an objective.
+    Minimise an objective; return the study of Optuna, with `best_params` and `best_value`.
 
     Parameters
     ----------
@@ -59,8 +51,8 @@ def minimise(
         From values by name to a number; one that is not finite counts as `BAD`.
     space : sequence of Dimension
     trials : int
-        Evaluations that the study shall hold at the end, with those that are in it already. The
-        first one is at the start of each dimension.
+        Evaluations that the study shall hold at the end, with those that are in it already, also
+        of other processes. The first one is at the start of each dimension.
     seed : int
         With one job and no storage, the result is a function of it.
     storage, name : str, optional
@@ -86,7 +78,6 @@ def minimise(
         ) from None
     optuna.logging.set_verbosity(optuna.logging.ERROR)
     start = {d.name: d.start for d in space}
-    finished = (optuna.trial.TrialState.COMPLETE,)
 
     def evaluate(trial: Any) -> float:
         values = {d.name: trial.suggest_float(d.name, d.low, d.high, log=d.log) for d in space}
@@ -94,7 +85,7 @@ def minimise(
         return value if math.isfinite(value) else BAD
 
     def after(study: Any, _: object) -> None:
-        if on_trial():
+        if on_trial() or finished(study) >= trials:
             study.stop()
 
     with warnings.catch_warnings():
@@ -110,10 +101,12 @@ def minimise(
     except Exception as error:  # SQLAlchemy and each driver have exceptions of their own
         first = str(error).partition('\n')[0]
         raise ConfigurationError(f'storage {storage!r}: Optuna cannot use it: {first}') from None
-    done = len(study.get_trials(deepcopy=False, states=finished))
-    if not done:
-        study.enqueue_trial(start, skip_if_exists=True)
-    enough = optuna.study.MaxTrialsCallback(trials, states=finished)  # of all processes
-    study.optimize(evaluate, max(trials - done, 0), n_jobs=jobs, callbacks=[after, enough])
-    count = len(study.get_trials(deepcopy=False, states=finished))
-    return Result(dict(study.best_params), study.best_value, count)
+    study.enqueue_trial(start, skip_if_exists=True)
+    left = max(trials - finished(study), 0)
+    study.optimize(evaluate, left, n_jobs=jobs, callbacks=[after])
+    return study
+
+
+def finished(study: Any) -> int:
+    """Return the number of the finished trials of a study, also of those of other processes."""
+    return sum(trial.state.name == 'COMPLETE' for trial in study.get_trials(deepcopy=False))

@@ -8,7 +8,7 @@ small grid. Then Optuna searches size and rate of d, and lambda follows. Else it
 themselves, from the user's, or the default ones.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 import hashlib
 from itertools import product
 import json
@@ -32,7 +32,7 @@ from fhaosmo_ros.tools.tuning.linear_gains import (
     WIDTH,
 )
 from fhaosmo_ros.tools.tuning.objective import Objective
-from fhaosmo_ros.tools.tuning.search import Dimension, minimise, Result, Values
+from fhaosmo_ros.tools.tuning.search import Dimension, minimise, Values
 import numpy as np
 
 HELD_OUT_SEED = 1_000_003
@@ -102,8 +102,7 @@ class Tuner:
         fuzzy = own.get('variant', SCHEME['variant']).startswith('fuzzy')
         kalman = fuzzy and not chosen_otherwise(own)
         if kalman:
-            self._noise, known = self._kalman_start(own)
-            self._fixed = known | own
+            self._fixed = self._kalman_start(own) | own
             free = {name: [own[name]] if name in own else grid for name, grid in GRID.items()}
             points = (dict(zip(free, point, strict=True)) for point in product(*free.values()))
             self._fixed |= _changes(min(points, key=self.evaluate)) | own
@@ -111,37 +110,34 @@ class Tuner:
         self.training(start)  # raises what `evaluate` takes for a bad point
         observer = Observer(ESTIMATOR_PARAMETERS.complete(start))
         model = [name for name in MODEL_OF_D if name not in own]
-        self.space = _make_space(model if kalman else _gains(observer.parameters), observer)
+        searched = model if kalman else _gains(observer.parameters)
+        self.space = [d for name in searched for d in _dimensions(name, observer)]
+        if not self.space:
+            raise ConfigurationError(
+                f'expected one of {", ".join(MODEL_OF_D)} to search, got both set'
+            )
 
-    def _kalman_start(self, own: Mapping[str, Any]) -> tuple[float, dict[str, Any]]:
-        """Return the size of the noise, and what the recordings say of the estimator."""
-        # With quantum and jitter.
-        noise = rms(np.concatenate([r.y - r.z[:, 0] for r in self.training.recordings]))
-        truth = np.concatenate([np.column_stack([r.z, r.d]) for r in self.training.recordings])
-        sizes = [rounded(rms(column)) for column in truth.T]
+    def _kalman_start(self, own: Mapping[str, Any]) -> dict[str, Any]:
+        """Set the size of the noise, and return what the recordings say of the estimator."""
+        recordings = self.training.recordings
+        sizes = [*map(rounded, rms(np.concatenate([np.c_[r.z, r.d] for r in recordings])))]
+        # With quantum and jitter. Without noise the fastest observer is deadbeat: the least noise
+        # is too small to slow it down.
+        noise = rounded(rms(np.concatenate([r.y - r.z[:, 0] for r in recordings])))
+        least = 0.1 * sizes[-1] * self._period ** (len(sizes) - 1)
+        self._noise, width = max(noise, least), noise
         found = {
             **SCHEME,
             'correction_period': self._period,
             'unknown_input_size': sizes[-1],
             'gamma_initial': min(max(GAMMA, own.get('gamma_min', 0.0)), own.get('gamma_max', 1.0)),
         }
-        # Without noise the fastest observer is deadbeat: this noise is too small to slow it down.
-        least = 0.1 * sizes[-1] * self._period ** (len(sizes) - 1)
         if noise <= least:
             # The largest innovations are those of the start: what z_2 moves y by in a period.
-            width = WIDTH * max(sizes[1] * self._period, least)
-            return least, found | {'fuzzy_widths': [width]}
-        noise = rounded(noise)
-        if min(sizes) > 0.0:
+            width = max(sizes[1] * self._period, least)
+        elif min(sizes) > 0.0:
             found |= {'noise_size': noise, 'state_sizes': sizes[:-1]}
-        return noise, found | {'fuzzy_widths': [WIDTH * noise]}
-
-    @property
-    def _study_name(self) -> str:
-        """Name of the study: a digest of all that its trials depend on."""
-        samples = [recording.y.tobytes() for recording in self.training.recordings]
-        problem = json.dumps([dict(self.tuning), self._fixed, self.space], sort_keys=True)
-        return f'tune-{hashlib.sha256(b"".join([problem.encode(), *samples])).hexdigest()[:16]}'
+        return found | {'fuzzy_widths': [WIDTH * width]}
 
     def parameters(self, values: Values) -> dict[str, Any]:
         """
@@ -172,7 +168,7 @@ class Tuner:
     def evaluate(self, values: Values) -> float:
         """Return the objective at a point of the space."""
         try:
-            return self.training(self.parameters(values)).error
+            return self.training(self.parameters(values))[0]
         except ConfigurationError:  # values out of their bounds, or that do not fit
             return math.inf
 
@@ -182,43 +178,34 @@ class Tuner:
         jobs: int = 1,
         storage: str | None = None,
         stopped: Callable[[], bool] = lambda: False,
-    ) -> Result:
+    ) -> Any:
         """Search as `minimise` does, or until `stopped` returns True after a trial."""
+        samples = [recording.y.tobytes() for recording in self.training.recordings]
+        problem = json.dumps([dict(self.tuning), self._fixed, self.space], sort_keys=True)
+        digest = hashlib.sha256(b''.join([problem.encode(), *samples])).hexdigest()[:16]
         with progress(total=trials, unit='trial', desc='tune', smoothing=0.05) as bar:
-
-            def on_trial() -> bool:
-                bar.update()
-                return stopped()
-
             return minimise(
                 self.evaluate, self.space, trials, self._seed, storage=storage,
-                name=self._study_name, jobs=jobs, on_trial=on_trial,
+                name=f'tune-{digest}', jobs=jobs, on_trial=lambda: bar.update() or stopped(),
             )  # fmt: skip
 
 
-def _make_space(names: Sequence[str], observer: Observer) -> list[Dimension]:
-    """Return the dimensions of a search: in powers of ten, where a parameter's scale is open."""
-    space: list[Dimension] = []
-    start = observer.parameters
-    for name in names:
-        declared, values, labels = OBSERVER_PARAMETERS[name], [start[name]], [name]
-        if isinstance(start[name], list):
-            values = [of_level(start[name], k) for k in range(observer.levels)]
-            labels = [f'{name}[{k}]' for k in range(observer.levels)]
-        for label, value in zip(labels, values, strict=True):
-            middle = value or 1.0  # such as unknown_input_decay, which may be 0
-            low = max(middle / 10.0**DECADES, declared.lower or 0.0)
-            high = min(middle * 10.0**DECADES, declared.upper or 1.0)
-            if name == 'gamma_initial':
-                low, high = start['gamma_min'], start['gamma_max']
-            log = 0.0 < 10.0 * low < high
-            begin = min(max(middle if log else value, low), high)
-            space.append(Dimension(label, low, high, begin, log))
-    if not space:
-        raise ConfigurationError(
-            f'expected one of {", ".join(MODEL_OF_D)} to search, got both set'
-        )
-    return space
+def _dimensions(name: str, observer: Observer) -> Iterator[Dimension]:
+    """Yield those of a parameter: in powers of ten, where its scale is open."""
+    declared, start = OBSERVER_PARAMETERS[name], observer.parameters
+    values = {name: start[name]}
+    if isinstance(start[name], list):
+        levels = range(observer.levels)
+        values = {f'{name}[{k}]': of_level(start[name], k) for k in levels}
+    for label, value in values.items():
+        middle = value or 1.0  # such as unknown_input_decay, which may be 0
+        low = max(middle / 10.0**DECADES, declared.lower or 0.0)
+        high = min(middle * 10.0**DECADES, declared.upper or 1.0)
+        if name == 'gamma_initial':
+            low, high = start['gamma_min'], start['gamma_max']
+        log = 0.0 < 10.0 * low < high
+        begin = min(max(middle if log else value, low), high)
+        yield Dimension(label, low, high, begin, log)
 
 
 def _changes(values: Values) -> dict[str, Any]:
