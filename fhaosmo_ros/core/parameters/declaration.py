@@ -105,12 +105,6 @@ class Parameter:
         return self.upper - self.lower <= 100.0 * (max(step, 1.0) if self.kind == 'int' else step)
 
     @property
-    def logarithmic(self) -> bool:
-        """True if sensible values spread over powers of ten, so that factors count."""
-        positive = self.lower is not None and self.lower >= 0.0
-        return self.kind in ('double', 'double_array') and positive and not self.slider
-
-    @property
     def allowed(self) -> str:
         """Allowed values, in words."""
         if self.choices:

@@ -171,12 +171,11 @@ class Family:
                 u[:, k] = p['rms_of_u'] * self._wave('sines', true_t, random)
         if u.shape[1] == 1:
             u = u[:, 0]
-        delay = p['measurement_delay']
-        moments = np.sort(np.concatenate([true_t, np.maximum(true_t - delay, 0.0)]))
-        moments = moments if delay > 0.0 else true_t
+        measured_t = np.maximum(true_t - p['measurement_delay'], 0.0)
+        moments = np.union1d(true_t, measured_t)
         acting = u[np.searchsorted(true_t, moments)]
         z, d = respond(self.model, self._start, moments, table, spacing, acting, spacing)
-        measured = z[np.searchsorted(moments, np.maximum(true_t - delay, 0.0)), 0]
+        measured = z[np.searchsorted(moments, measured_t), 0]
         z, d = (values[np.searchsorted(moments, true_t)] for values in (z, d))
         if not np.isfinite(z).all():
             raise ConfigurationError(
@@ -212,12 +211,9 @@ class Family:
             share = (np.arange(SINES) + random.uniform(size=SINES)) / SINES
             amplitude = random.uniform(0.5, 1.5, SINES)
             amplitude *= np.sqrt(2.0 / np.sum(amplitude**2))
-            phase = random.uniform(0.0, 2.0 * np.pi, SINES)
-            rows = zip(amplitude, low * (high / low) ** share, phase, strict=True)
-            wave = np.zeros_like(t)
-            for a, omega, start in rows:
-                wave += a * np.sin(omega * t + start)
-            return wave
+            phase = random.uniform(0.0, 2.0 * np.pi, (SINES, 1))
+            sines = np.sin(np.outer(low * (high / low) ** share, t) + phase)
+            return np.asarray(np.sum(amplitude[:, np.newaxis] * sines, axis=0))
         if shape == 'chirp':  # from one end of the band to the other, exponentially
             first, last = (low, high) if random.uniform() < 0.5 else (high, low)
             rate = np.log(last / first) / t[-1]

@@ -173,17 +173,14 @@ class Identification:
         self.quantum = quantum(y)
         self._rounding = self.quantum / math.sqrt(12.0)
         rough = float(median_abs_deviation(np.diff(y, 4), scale='normal')) / math.sqrt(70.0)
-        self.fixed = bool(given.get('noise_size'))
-        self._noise = max(rough, self._rounding, 1e-9 * float(np.std(y)))
-        if self.fixed:
-            self._noise = given['noise_size']
+        guess = max(rough, self._rounding, 1e-9 * float(np.std(y)))
+        self._noise, self.fixed = given.get('noise_size') or guess, bool(given.get('noise_size'))
         self._clip = math.inf  # standard deviations, of the innovations by which it corrects
         with progress(unit='filter', desc='likelihood', leave=False) as self._bar:
             start = self._start()
             self.outliers = self._leave_out_outliers(start)
-            tried: tuple[int, ...] = DERIVATIVES
-            if 'unknown_input_derivatives' in given:
-                tried = (given['unknown_input_derivatives'],)
+            set_by_user = given.get('unknown_input_derivatives')
+            tried = DERIVATIVES if set_by_user is None else [set_by_user]
             self.best, *others = [self._fit(start.design._replace(derivatives=k)) for k in tried]
             for richer in others:
                 if richer.log_likelihood > self.best.log_likelihood + WORTH:

@@ -43,11 +43,14 @@ class Objective:
     Parameters
     ----------
     recordings : sequence of Recording
-        Each longer than `settled`.
+        To train on, each longer than `settled`.
     tuning : mapping
         Of `TUNING`, complete.
-    scale : array, optional
-        RMS values that errors are divided by; by default those of the truth of these recordings.
+
+    Attributes
+    ----------
+    scale : (n + 1,) array
+        RMS values of their z and d that errors are divided by.
 
     Raises
     ------
@@ -56,12 +59,7 @@ class Objective:
 
     """
 
-    def __init__(
-        self,
-        recordings: Sequence[Recording],
-        tuning: Mapping[str, Any],
-        scale: Floats | None = None,
-    ) -> None:
+    def __init__(self, recordings: Sequence[Recording], tuning: Mapping[str, Any]) -> None:
         self.recordings, self._settled = recordings, tuning['settled']
         shortest = min(r.t[-1] - r.t[0] for r in recordings)
         if shortest <= self._settled:
@@ -69,7 +67,7 @@ class Objective:
                 f'recording: expected more than {self._settled:g} s (settled), got {shortest:g} s'
             )
         late = [np.column_stack([r.z, r.d])[r.t - r.t[0] >= self._settled] for r in recordings]
-        self.scale = rms(np.concatenate(late)) if scale is None else scale
+        self.scale = rms(np.concatenate(late))
         weights, count = tuning['weights'], len(self.scale)
         if len(weights) not in (1, count) or not sum(weights) > 0.0:
             raise TUNE_PARAMETERS['weights'].error(
@@ -78,9 +76,11 @@ class Objective:
         self._weights = np.zeros(count)
         self._weights[-len(weights) :] = np.array(weights) / sum(weights)
 
-    def __call__(self, parameters: Mapping[str, Any]) -> tuple[float, Floats]:
+    def __call__(
+        self, parameters: Mapping[str, Any], held_out: Sequence[Recording] = ()
+    ) -> tuple[float, Floats]:
         """
-        Evaluate parameters of the estimator.
+        Evaluate parameters of the estimator on these recordings, or on those held out.
 
         Returns
         -------
@@ -103,7 +103,7 @@ class Objective:
             raise ConfigurationError(
                 f"'order': expected {states}, the states of the plant's recordings, got {order}"
             )
-        errors = np.array([self._judge(estimator, r) for r in self.recordings])
+        errors = np.array([self._judge(estimator, r) for r in held_out or self.recordings])
         used = self._weights > 0.0
         with np.errstate(over='ignore', divide='ignore'):  # of a truth that is 0 throughout
             relative = np.square(errors[:, used] / self.scale[used])

@@ -38,16 +38,15 @@ def of_search(tuner: Tuner, study: Any) -> tuple[dict[str, Any], str]:
     tuned, columns, found = tuner.parameters(study.best_params), [''], []
     start = tuner.parameters({d.name: d.start for d in tuner.space})
     for title, parameters in (('start', start), ('tuned', tuned)):
-        for data, objective in (('training', tuner.training), ('held out', tuner.held_out)):
-            columns.append(f'{title}, {data}')
-            found.append(objective(parameters))
+        columns += [f'{title}, training', f'{title}, held out']
+        found += [tuner.objective(parameters), tuner.objective(parameters, tuner.held_out)]
     rows = [['error, relative to the truth', *(f'{error:.4f}' for error, _ in found)]]
-    names = [*(f'z{k}' for k in range(1, len(tuner.training.scale))), 'd']
+    names = [*(f'z{k}' for k in range(1, len(tuner.objective.scale))), 'd']
     for name, of_name in zip(names, zip(*(rms(e) for _, e in found), strict=True), strict=True):
         rows.append([f'RMS error of {name}', *(f'{error:.3g}' for error in of_name)])
     text = '\n\n'.join([
-        f'{finished(study)} trials on {len(tuner.training.recordings)} simulated recordings; '
-        f'{len(tuner.held_out.recordings)} others, held out, took no part in the search.',
+        f'{finished(study)} trials on {len(tuner.objective.recordings)} simulated recordings; '
+        f'{len(tuner.held_out)} others, held out, took no part in the search.',
         table(columns, rows),
     ])  # fmt: skip
     return tuned, text

@@ -92,13 +92,12 @@ class Tuner:
         tuning: Mapping[str, Any],
         seed: int,
     ) -> None:
-        self.tuning, self._seed = tuning, seed
+        self.tuning, self.held_out, self._seed = tuning, held_out, seed
         self._period = rounded(float(np.median(np.diff(training[0].t))))
         # The estimator may have a model of its own, other than the plant's.
         own = {name: tuning[name] for name in ('order', 'phi')} | dict(estimator)
         self._noise, self._fixed = 0.0, own
-        self.training = Objective(training, tuning)
-        self.held_out = Objective(held_out, tuning, self.training.scale)
+        self.objective = Objective(training, tuning)
         fuzzy = own.get('variant', SCHEME['variant']).startswith('fuzzy')
         kalman = fuzzy and not chosen_otherwise(own)
         if kalman:
@@ -107,7 +106,7 @@ class Tuner:
             points = (dict(zip(free, point, strict=True)) for point in product(*free.values()))
             self._fixed |= _changes(min(points, key=self.evaluate)) | own
         start = self.parameters({})
-        self.training(start)  # raises what `evaluate` takes for a bad point
+        self.objective(start)  # raises what `evaluate` takes for a bad point
         observer = Observer(ESTIMATOR_PARAMETERS.complete(start))
         model = [name for name in MODEL_OF_D if name not in own]
         searched = model if kalman else _gains(observer.parameters)
@@ -119,7 +118,7 @@ class Tuner:
 
     def _kalman_start(self, own: Mapping[str, Any]) -> dict[str, Any]:
         """Set the size of the noise, and return what the recordings say of the estimator."""
-        recordings = self.training.recordings
+        recordings = self.objective.recordings
         sizes = [*map(rounded, rms(np.concatenate([np.c_[r.z, r.d] for r in recordings])))]
         # With quantum and jitter. Without noise the fastest observer is deadbeat: the least noise
         # is too small to slow it down.
@@ -168,7 +167,7 @@ class Tuner:
     def evaluate(self, values: Values) -> float:
         """Return the objective at a point of the space."""
         try:
-            return self.training(self.parameters(values))[0]
+            return self.objective(self.parameters(values))[0]
         except ConfigurationError:  # values out of their bounds, or that do not fit
             return math.inf
 
@@ -180,7 +179,7 @@ class Tuner:
         stopped: Callable[[], bool] = lambda: False,
     ) -> Any:
         """Search as `minimise` does, or until `stopped` returns True after a trial."""
-        samples = [recording.y.tobytes() for recording in self.training.recordings]
+        samples = [recording.y.tobytes() for recording in self.objective.recordings]
         problem = json.dumps([dict(self.tuning), self._fixed, self.space], sort_keys=True)
         digest = hashlib.sha256(b''.join([problem.encode(), *samples])).hexdigest()[:16]
         with progress(total=trials, unit='trial', desc='tune', smoothing=0.05) as bar:
