@@ -331,9 +331,8 @@ def _papers(variant: str) -> dict[str, Any]:
 def _tune(search: Search) -> Values:
     """Return the parameters of the estimator that `tune` writes; its grid uses trials, too."""
     tuning = TUNE_PARAMETERS.complete(search.setting.told | {'settled': JUDGED_FROM})
-    recordings = list(search.recordings)
     with redirect_stderr(StringIO()):  # its progress bars
-        tuner = Tuner(recordings, recordings[:1], {}, tuning, search.seed)
+        tuner = Tuner(list(search.recordings), {}, tuning, search.seed)
         return tuner.parameters(tuner.search(max(1, search.trials - GRID)).best_params)
 
 

@@ -81,10 +81,10 @@ def _tune(arguments: argparse.Namespace, stop: Stop) -> None:
             with stop.raising():
                 training, held_out = simulated(values, arguments.seed)
                 print(f'{len(training)} recordings to train on, {len(held_out)} held out')
-                tuner = Tuner(training, held_out, estimator, values, arguments.seed)
+                tuner = Tuner(training, estimator, values, arguments.seed)
             jobs = arguments.jobs or os.cpu_count() or 1
             study = tuner.search(arguments.trials, jobs, arguments.storage, stop.is_set)
-            parameters, text = report.of_search(tuner, study)
+            parameters, text = report.of_search(tuner, study, held_out)
         report.save(folder, arguments.command_line, parameters, text)
     gains = arguments.output / 'gains.yaml'
     print(f'\n{text}\n\noutput: {gains}, report.md')

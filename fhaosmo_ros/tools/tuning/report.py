@@ -10,6 +10,7 @@ from fhaosmo_ros import __version__
 from fhaosmo_ros.core.parameters.files import dumps
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
 from fhaosmo_ros.core.simulation.metrics import rms
+from fhaosmo_ros.core.simulation.recordings import Recording
 from fhaosmo_ros.tools.tuning.identify import Identification, SURE
 from fhaosmo_ros.tools.tuning.search import finished
 from fhaosmo_ros.tools.tuning.tuner import Tuner
@@ -33,20 +34,20 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     return '\n'.join(f'| {" | ".join(cells)} |' for cells in lines)
 
 
-def of_search(tuner: Tuner, study: Any) -> tuple[dict[str, Any], str]:
+def of_search(tuner: Tuner, study: Any, held_out: list[Recording]) -> tuple[dict[str, Any], str]:
     """Return the gains for a simulated family, and a report of them."""
     tuned, columns, found = tuner.parameters(study.best_params), [''], []
     start = tuner.parameters({d.name: d.start for d in tuner.space})
     for title, parameters in (('start', start), ('tuned', tuned)):
         columns += [f'{title}, training', f'{title}, held out']
-        found += [tuner.objective(parameters), tuner.objective(parameters, tuner.held_out)]
+        found += [tuner.objective(parameters), tuner.objective(parameters, held_out)]
     rows = [['error, relative to the truth', *(f'{error:.4f}' for error, _ in found)]]
     names = [*(f'z{k}' for k in range(1, len(tuner.objective.scale))), 'd']
     for name, of_name in zip(names, zip(*(rms(e) for _, e in found), strict=True), strict=True):
         rows.append([f'RMS error of {name}', *(f'{error:.3g}' for error in of_name)])
     text = '\n\n'.join([
         f'{finished(study)} trials on {len(tuner.objective.recordings)} simulated recordings; '
-        f'{len(tuner.held_out)} others, held out, took no part in the search.',
+        f'{len(held_out)} others, held out, took no part in the search.',
         table(columns, rows),
     ])  # fmt: skip
     return tuned, text

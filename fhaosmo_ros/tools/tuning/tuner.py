@@ -69,8 +69,7 @@ class Tuner:
 
     Parameters
     ----------
-    training, held_out : list of Recording
-        To train on, and to judge by.
+    training : list of Recording
     estimator : mapping
         What the user set for the estimator.
     tuning : mapping
@@ -87,12 +86,11 @@ class Tuner:
     def __init__(
         self,
         training: list[Recording],
-        held_out: list[Recording],
         estimator: Mapping[str, Any],
         tuning: Mapping[str, Any],
         seed: int,
     ) -> None:
-        self.tuning, self.held_out, self._seed = tuning, held_out, seed
+        self.tuning, self._seed = tuning, seed
         self._period = rounded(float(np.median(np.diff(training[0].t))))
         # The estimator may have a model of its own, other than the plant's.
         own = {name: tuning[name] for name in ('order', 'phi')} | dict(estimator)
