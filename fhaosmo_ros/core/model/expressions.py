@@ -12,7 +12,6 @@ import keyword
 import math
 import re
 import sys
-from typing import NamedTuple
 import warnings
 
 from fhaosmo_ros.core.model import phi
@@ -28,16 +27,19 @@ An operator takes some 15 ns, a function up to 100 ns, and with its default step
 evaluates every Phi 40,000 times in a simulated second.
 """
 
-FUNCTIONS: dict[str, int] = {
-    name: getattr(phi, name.upper())
-    for name in ('sin', 'cos', 'tan', 'exp', 'log', 'sqrt', 'abs', 'tanh', 'sign')
+ARGUMENTS = {
+    range(1, 2): 'one argument',
+    range(2, 3): 'two arguments',
+    range(2, MAX_LENGTH): 'two arguments or more',
 }
-"""Functions of one argument."""
-FUNCTIONS_OF_SEVERAL = {'atan2': phi.ATAN2, 'min': phi.MIN, 'max': phi.MAX}
-"""Functions of two arguments; min and max also take more."""
+"""How many arguments functions take, and how that is said."""
+ONE, TWO, MORE = ARGUMENTS
+FUNCTIONS = dict.fromkeys(
+    ('sin', 'cos', 'tan', 'exp', 'log', 'sqrt', 'abs', 'tanh', 'sign'), ONE
+) | {'atan2': TWO, 'min': MORE, 'max': MORE}  # fmt: skip
 NUMBERS = {'pi': math.pi}
 """Names of numbers."""
-KNOWN = [*FUNCTIONS, *FUNCTIONS_OF_SEVERAL, *NUMBERS]
+KNOWN = [*FUNCTIONS, *NUMBERS]
 OPERATORS: dict[type[ast.operator], int] = {
     ast.Add: phi.ADD,
     ast.Sub: phi.SUB,
@@ -45,13 +47,8 @@ OPERATORS: dict[type[ast.operator], int] = {
     ast.Div: phi.DIV,
     ast.Pow: phi.POW,
 }
-
-
-class Instruction(NamedTuple):
-    """One operation, in postfix order."""
-
-    code: int
-    operand: float = 0.0
+Operation = tuple[int, float]
+"""A code of `phi`, and the index or the number that belongs to it."""
 
 
 def check_names(inputs: Sequence[str], constants: Mapping[str, float]) -> None:
@@ -72,14 +69,14 @@ def check_names(inputs: Sequence[str], constants: Mapping[str, float]) -> None:
 
 def parse(
     text: str, level: int, inputs: Sequence[str] = ('u',), constants: Mapping[str, float] = {}
-) -> list[Instruction]:
+) -> list[Operation]:
     """
     Parse Phi_level, which may use z1 .. z<level>, known inputs and constants by their names.
 
     Returns
     -------
-    list of Instruction
-        In postfix order; empty for an expression that is the constant 0.
+    list of (int, float)
+        Operations in postfix order; empty for an expression that is the constant 0.
 
     Raises
     ------
@@ -102,8 +99,8 @@ def parse(
     work = sum(isinstance(node, ast.Call | ast.BinOp | ast.UnaryOp) for node in ast.walk(body))
     if work > MAX_OPERATIONS:  # at every evaluation
         raise parser.error(f'{work} operations, at most {MAX_OPERATIONS}')
-    instructions = parser.emit(body)
-    return [] if instructions == [Instruction(phi.CONST, 0.0)] else instructions
+    parser.emit(body)
+    return [] if parser.code == [(phi.CONST, 0.0)] else parser.code
 
 
 class _Parser:
@@ -111,70 +108,70 @@ class _Parser:
         self, text: str, level: int, inputs: Sequence[str], constants: Mapping[str, float]
     ) -> None:
         self.text, self.level, self.others = text, level, [*inputs, *constants]
-        self.names = {f'z{j + 1}': Instruction(phi.STATE, j) for j in range(level)}
-        self.names |= {name: Instruction(phi.INPUT, k) for k, name in enumerate(inputs)}
-        for name, number in (NUMBERS | dict(constants)).items():
-            self.names[name] = Instruction(phi.CONST, number)
+        self.code: list[Operation] = []
+        self.names: dict[str, Operation] = {f'z{j + 1}': (phi.STATE, j) for j in range(level)}
+        self.names |= {name: (phi.INPUT, k) for k, name in enumerate(inputs)}
+        self.names |= {name: (phi.CONST, x) for name, x in (NUMBERS | dict(constants)).items()}
 
-    def emit(self, node: ast.expr) -> list[Instruction]:
+    def emit(self, node: ast.expr) -> None:
+        """Append the operations of a part of the expression."""
         match node:
             case ast.Constant(value=bool()):
                 raise self.error(f'{node.value!r} is not a number')
             case ast.Constant(value=int() | float() as number):
                 if number > sys.float_info.max:
                     raise self.error('a number is too large')
-                return [Instruction(phi.CONST, float(number))]
+                self.code.append((phi.CONST, float(number)))
             case ast.Name(id=name):
-                return [self.name(name)]
+                self.code.append(self.name(name))
             case ast.UnaryOp(op=ast.UAdd(), operand=operand):
-                return self.emit(operand)
+                self.emit(operand)
             case ast.UnaryOp(op=ast.USub(), operand=operand):
-                return self.fold([*self.emit(operand), Instruction(phi.NEG)])
+                self.apply(phi.NEG, [operand])
             case ast.BinOp(left=left, op=op, right=right) if type(op) in OPERATORS:
-                a, b = self.emit(left), self.emit(right)
-                return self.fold([*a, *b, Instruction(OPERATORS[type(op)])])
+                self.apply(OPERATORS[type(op)], [left, right])
             case ast.BinOp(op=ast.BitXor()):
                 raise self.error("'^' is not allowed, a power is written z1**2")
             case ast.Call(func=ast.Name(id=name), args=arguments, keywords=[]):
-                return self.call(name, [self.emit(a) for a in arguments])
-        part = ast.get_source_segment(self.text.strip(), node) or ''
-        raise self.error(f'{part[:60]!r} is not allowed')
+                if name not in FUNCTIONS:
+                    raise self.error(f"unknown function '{name}'{suggestion(name, FUNCTIONS)}")
+                if len(arguments) not in FUNCTIONS[name]:
+                    needed = ARGUMENTS[FUNCTIONS[name]]
+                    raise self.error(f'{name} needs {needed}, got {len(arguments)}')
+                self.apply(getattr(phi, name.upper()), arguments)
+            case _:
+                part = ast.get_source_segment(self.text.strip(), node) or ''
+                raise self.error(f'{part[:60]!r} is not allowed')
 
-    def call(self, name: str, arguments: list[list[Instruction]]) -> list[Instruction]:
-        known = FUNCTIONS | FUNCTIONS_OF_SEVERAL
-        if name not in known:
-            raise self.error(f"unknown function '{name}'{suggestion(name, known)}")
-        count, several = len(arguments), name in FUNCTIONS_OF_SEVERAL
-        if count != 1 + several and not (name in ('min', 'max') and count > 2):
-            raise self.error(f'{_needs(name)}, got {count}')
-        result, *rest = arguments
-        for argument in rest if several else [[]]:
-            result = self.fold([*result, *argument, Instruction(known[name])])
-        return result
+    def apply(self, code: int, operands: list[ast.expr]) -> None:
+        """Append an operation on one or two operands; on more, on its result and the next one."""
+        count = min(len(operands), 2)
+        for k, operand in enumerate(operands, 1):
+            self.emit(operand)
+            if k < count:
+                continue
+            self.code.append((code, 0.0))
+            last = self.code[-1 - count :]
+            if all(kind == phi.CONST for kind, _ in last[:-1]):  # its result stands for it
+                value = float(phi.Expressions([last], 0, 0).along([0.0], [0.0], [0.0])[0, 0])
+                if not math.isfinite(value):
+                    raise self.error('a constant part of it is not a finite number')
+                self.code[-1 - count :] = [(phi.CONST, value)]
 
-    def name(self, name: str) -> Instruction:
+    def name(self, name: str) -> Operation:
         if name in self.names:
             return self.names[name]
         if name[:1] == 'z' and name[1:].isdigit() and int(name[1:]) > self.level:
             raise self.error(
                 f'{name} comes after z{self.level}: the model would not be triangular'
             )
-        if name in FUNCTIONS or name in FUNCTIONS_OF_SEVERAL:
-            raise self.error(_needs(name))
+        if name in FUNCTIONS:
+            raise self.error(f'{name} needs {ARGUMENTS[FUNCTIONS[name]]}')
         hint = suggestion(name, [*self.names, *KNOWN])
         raise self.error(
             f"unknown name '{name}'{hint}; 'inputs' declares known inputs and 'constants.{name}' "
             'a constant'
         )
-
-    def fold(self, instructions: list[Instruction]) -> list[Instruction]:
-        """Replace an operation on constants by its result."""
-        if any(i.code != phi.CONST for i in instructions[:-1]):
-            return instructions
-        value = float(phi.Expressions([instructions], 0, 0).along([0.0], [0.0], [0.0])[0, 0])
-        if not math.isfinite(value):
-            raise self.error('a constant part of it is not a finite number')
-        return [Instruction(phi.CONST, value)]
 
     def error(self, reason: str) -> ConfigurationError:
         states = 'z1' if self.level == 1 else f'z1..z{self.level}'
@@ -185,13 +182,7 @@ class _Parser:
         )
 
 
-def _needs(name: str) -> str:
-    if name in FUNCTIONS:
-        return f'{name} needs one argument'
-    return f'{name} needs two arguments{"" if name == "atan2" else " or more"}'
-
-
-def is_linear(tokens: Sequence[tuple[int, float]]) -> bool:
+def is_linear(tokens: Sequence[Operation]) -> bool:
     """Return True if an expression is sums of states times numbers, and of anything else."""
     # 0: a number, 1: a number or known inputs, 2: linear in the states, 3: anything else
     stack: list[int] = []
