@@ -2,6 +2,7 @@
 """What a parameter is: declared once, checked everywhere by the same rules."""
 
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
 from copy import copy
 from dataclasses import dataclass, replace
 import difflib
@@ -24,23 +25,9 @@ KINDS = {
     'double_array': 'a list of numbers',
     'string_array': 'a list of strings',
 }
+TYPES: dict[str, Any] = {'bool': bool, 'int': int, 'double': float, 'string': str}
 ANY_NAME = '.NAME'
 """End of the name of a declaration that stands for any number of parameters."""
-
-
-def _typed(kind: str, item: Any) -> Any:
-    """Return a value, or an item of a list, in the type of a kind; None where it has another."""
-    is_number = isinstance(item, int | float) and not isinstance(item, bool)
-    if kind.startswith('double'):
-        try:
-            return float(item) if is_number else None
-        except OverflowError:
-            return None
-    if kind == 'string_array' and is_number:
-        return repr(item)  # a bare 0 in `phi: [0, 0, -z3]` is a number to YAML, not to its writer
-    if kind == 'int':
-        return item if is_number and isinstance(item, int) else None
-    return item if isinstance(item, bool if kind == 'bool' else str) else None
 
 
 @dataclass(frozen=True)
@@ -88,8 +75,7 @@ class Parameter:
         """One of the keys of `KINDS`."""
         is_list = isinstance(self.default, list)
         item = self.default[0] if isinstance(self.default, list) else self.default
-        names = {bool: 'bool', int: 'int', float: 'double', str: 'string'}
-        return names[type(item)] + '_array' * is_list
+        return next(kind for kind in TYPES if TYPES[kind] is type(item)) + '_array' * is_list
 
     @property
     def slider(self) -> bool:
@@ -142,22 +128,28 @@ class Parameter:
             value = [value]
         elif isinstance(value, str | bytes | Mapping) or not isinstance(value, Iterable):
             raise self.error(given)  # rclpy delivers array.array, so any other iterable will do
-        items = [_typed(kind, item) for item in value]
-        if not items or not all(self._within(item) for item in items):
+        items = [self._item(item) for item in value]
+        if not items or None in items:
             raise self.error(given)
         return items if is_list else items[0]
 
-    def _within(self, item: Any) -> bool:
-        """Return True for a value of the right type, within the bounds."""
-        if item is None or (self.choices and item not in self.choices):
-            return False
+    def _item(self, item: Any) -> Any:
+        """Return a value, or an item of a list, in its type; None where it is not allowed."""
+        wanted = TYPES[self.kind.removesuffix('_array')]
+        is_number = isinstance(item, int | float) and not isinstance(item, bool)
+        if self.kind == 'string_array' and is_number:
+            item = repr(item)  # 0 in `phi: [0, 0, -z3]` is a number to YAML, not to its writer
+        elif wanted is float and is_number:
+            with suppress(OverflowError):
+                item = float(item)
+        if not isinstance(item, wanted) or isinstance(item, bool) != (wanted is bool):
+            return None
         if isinstance(item, bool | str):
-            return True
-        if isinstance(item, float) and not math.isfinite(item):
-            return False
+            return item if not self.choices or item in self.choices else None
         lower = -math.inf if self.lower is None else self.lower
         upper = math.inf if self.upper is None else self.upper
-        return lower < item <= upper or (item == lower and not self.lower_open)
+        within = lower < item <= upper or (item == lower and not self.lower_open)
+        return item if within and abs(item) != math.inf else None
 
     def error(self, value: Any, allowed: str | None = None) -> ConfigurationError:
         """Build the error for `value`: what was wrong, what is allowed, what arrived."""
