@@ -22,7 +22,7 @@ from fhaosmo_ros.core.parameters.per_channel import (
     with_channels,
     with_own_parameters,
 )
-from fhaosmo_ros.core.parameters.tables import NODE_TABLES
+from fhaosmo_ros.core.parameters.tables import CHANNEL_PARAMETERS, NODE_TABLES
 from fhaosmo_ros.core.parameters.yaml_text import MAX_LENGTH, parse
 import yaml
 
@@ -138,10 +138,10 @@ def select(values: Mapping[str, Any], table: ParameterTable) -> dict[str, Any]:
 
     """
     names = channel_names(values)
-    own = with_own_parameters(names, values)
+    estimator = with_channels(with_own_parameters(names, values))
     if CHANNELS in table:
-        table = with_channels(table, own)
-    tables = [table, *(with_channels(other, own) for other in NODE_TABLES.values())]
+        table = estimator
+    tables = [table, estimator, *NODE_TABLES.values()]
     for name in values:
         if not any(name in other for other in tables) and not is_built_in(name):
             raise unknown_parameter(name, dict.fromkeys(n for other in tables for n in other))
@@ -159,8 +159,15 @@ def complete(values: Mapping[str, Any], table: ParameterTable) -> Parameters:
     The channels' own parameters are among the result; they default to the common values.
     """
     checked = select(values, table)
-    own = with_own_parameters(checked.get(CHANNELS, UNNAMED), checked)
-    return Parameters(with_channels(table, own, checked), checked)
+    channels = with_own_parameters(checked.get(CHANNELS, UNNAMED), checked)
+    common = table.defaults() | checked
+    own = {
+        f'{channel}.{name}': value
+        for channel in filter(None, channels)
+        for name, value in common.items()
+        if name in CHANNEL_PARAMETERS
+    }
+    return Parameters(with_channels(channels) if own else table, own | checked)
 
 
 def make_from_file(

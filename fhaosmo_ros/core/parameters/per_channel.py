@@ -2,8 +2,7 @@
 """
 Parameters of an estimator with many channels: ``hip.lambda`` is channel hip's own ``lambda``.
 
-A channel takes its own value where it has one, else the common value. The table of m channels is
-the common table and m prefixed copies of it.
+A channel takes its own value where it has one, else the common value.
 """
 
 from collections.abc import Iterable, Mapping
@@ -14,6 +13,7 @@ from typing import Any, TypeVar
 from fhaosmo_ros.core.parameters.declaration import Parameters, ParameterTable
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.tables import (
+    CHANNEL,
     CHANNEL_PARAMETERS,
     CONSTANTS,
     ESTIMATOR_PARAMETERS,
@@ -73,25 +73,10 @@ def with_own_parameters(names: list[str], values: Iterable[str]) -> list[str]:
     ))  # fmt: skip
 
 
-def with_channels(
-    table: ParameterTable, names: Iterable[str], values: Mapping[str, Any] | None = None
-) -> ParameterTable:
-    """
-    Return `table` and, for each named channel, a copy of the `CHANNEL_PARAMETERS` in it.
-
-    The copies default to the checked common `values`.
-    """
-    values = values or {}
-    common = [p for p in table.values() if p.name in CHANNEL_PARAMETERS]
-    common += [table[name] for name in values if name.startswith(CONSTANTS)]
-    common += table.families
-    own = [
-        replace(p, name=f'{name}.{p.name}', default=values.get(p.name, p.default))
-        for name in names
-        if name
-        for p in common
-    ]
-    return ParameterTable(table.values(), table.families, own)
+def with_channels(names: Iterable[str]) -> ParameterTable:
+    """Return the table of an estimator, with each named channel's own parameters."""
+    own = [replace(p, name=f'{name}.{p.name}') for name in names if name for p in CHANNEL]
+    return ParameterTable(ESTIMATOR_PARAMETERS.values(), ESTIMATOR_PARAMETERS.families, own)
 
 
 def of_channel(values: Values, name: str) -> Values:
