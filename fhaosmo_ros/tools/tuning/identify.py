@@ -358,9 +358,8 @@ class Identification:
             **self._given,
         }
         checked = OBSERVER_PARAMETERS.complete(OBSERVER_PARAMETERS.part_of(values))
-        lambdas, k, p, variance = kalman_gains(checked, period)
+        lambdas, errors = kalman_gains(checked, period)
         values['lambda'] = [rounded(x) for x in lambdas]
-        errors = np.sqrt(np.maximum(np.diag(p) - k**2 * variance, 0.0))
         share = errors[order] / of_d
         if share > UNSEEN:
             raise ConfigurationError(

@@ -2,7 +2,7 @@
 """lambda with which the observer is a Kalman filter (D 17 to D 19)."""
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 from fhaosmo_ros.core.model.triangular import TriangularModel
 from fhaosmo_ros.core.observer.configuration import deadbeat_shares
@@ -36,15 +36,6 @@ LEAST = 1e-30
 """Gain that stands for one that is not positive."""
 
 
-class KalmanGains(NamedTuple):
-    """The steady-state Kalman filter of a model, and the observer of N levels that equals it."""
-
-    lambdas: Floats  # (N,) of the observer
-    gain: Floats  # (N,) K of a filter that predicts and then corrects
-    predicted: Floats  # (N, N) covariance of the errors of its predictions
-    variance: float  # of its innovations
-
-
 def chosen_otherwise(estimator: Mapping[str, Any]) -> list[str]:
     """Return the parameters, as set by the user, that ask for something else than `SCHEME`."""
     found = [k for k in ('structure', 'scheme') if estimator.get(k, SCHEME[k]) != SCHEME[k]]
@@ -56,7 +47,7 @@ def chosen_otherwise(estimator: Mapping[str, Any]) -> list[str]:
     ]
 
 
-def kalman_gains(p: Mapping[str, Any], period: float) -> KalmanGains:
+def kalman_gains(p: Mapping[str, Any], period: float) -> tuple[Floats, Floats]:
     """
     Return lambda with which predict_correct is the Kalman filter that parameters ask for (D 19).
 
@@ -67,6 +58,12 @@ def kalman_gains(p: Mapping[str, Any], period: float) -> KalmanGains:
         for all levels, and gamma_initial.
     period : float
         Sampling period (s).
+
+    Returns
+    -------
+    lambdas : (N,) array
+    errors : (N,) array
+        Standard deviations of the errors of the filter's estimates, once they are steady.
 
     Raises
     ------
@@ -95,7 +92,7 @@ def kalman_gains(p: Mapping[str, Any], period: float) -> KalmanGains:
         raise ConfigurationError(f'Kalman gain: expected psi > 0 at {small:g}, got {psi}')
     lambdas = injections * small ** (1.0 - power) / psi
     lambdas = lambdas.clip(LEAST, OBSERVER_PARAMETERS['lambda'].upper)
-    return KalmanGains(lambdas, gain, predicted, variance)
+    return lambdas, np.sqrt(np.maximum(np.diag(predicted) - gain**2 * variance, 0.0))
 
 
 def rounded(value: float) -> float:

@@ -153,7 +153,7 @@ class Tuner:
             power = p['gamma_initial'] if p['variant'].endswith('_adaptive') else FIXED_GAMMA
             noise = p['noise_size'] or self._noise
             design = p.changed({'noise_size': noise, 'gamma_initial': power})
-            found['lambda'] = [*map(rounded, kalman_gains(design, self._period).lambdas)]
+            found['lambda'] = [*map(rounded, kalman_gains(design, self._period)[0])]
             if not p['noise_size']:  # nothing says how sure the observer is
                 found.pop('unknown_input_size')
         if p['structure'] == 'levant' and p['variant'].startswith('fuzzy') and not p['noise_size']:
