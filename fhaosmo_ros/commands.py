@@ -33,7 +33,7 @@ COMMANDS = {
         'fhaosmo_ros.tools.replay.command',
         'estimate offline from a bag, as the live node would',
     ),
-    'plot': ('fhaosmo_ros.tools.plot.command', 'draw the estimates in bags, print their metrics'),
+    'plot': ('fhaosmo_ros.tools.plot', 'draw the estimates in bags, print their metrics'),
     'play': ('fhaosmo_ros.tools.play', "publish a bag's topics in its own time, with /clock"),
     'tune': ('fhaosmo_ros.tools.tuning.command', 'find gains that fit the sensor and the plant'),
 }

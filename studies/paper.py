@@ -18,7 +18,7 @@ from fhaosmo_ros.core.parameters.files import load
 from fhaosmo_ros.core.parameters.tables import OBSERVER_PARAMETERS, PLANT_PARAMETERS
 from fhaosmo_ros.core.simulation.metrics import chatter, high_passed, rms
 from fhaosmo_ros.tools.cli.command import shipped
-from fhaosmo_ros.tools.plot.figures import COLOURS, envelope, TRUTH
+from fhaosmo_ros.tools.plot import COLOURS, envelope, TRUE_STYLE
 from matplotlib.figure import Figure
 import numpy as np
 from studies import evidence
@@ -204,7 +204,7 @@ SKIPPED = 4  # with --quick every fourth case is computed
 DRAWN = (FINE, COARSE, FUZZY, ADAPTIVE)
 # Estimates that chatter are solid and below; the truth lies on top, dashed so that both are seen.
 RED = {'color': COLOURS[0], 'linewidth': 0.9, 'label': 'estimate'}
-BLUE = {'color': TRUTH['color'], 'linewidth': 1.7, 'linestyle': (0, (5, 2)), 'label': 'truth'}
+BLUE = {'color': TRUE_STYLE['color'], 'linewidth': 1.7, 'linestyle': (0, (5, 2)), 'label': 'truth'}
 
 
 def measure(arguments: argparse.Namespace, results: Results) -> Found:

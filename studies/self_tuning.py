@@ -16,7 +16,7 @@ import sys
 from typing import NamedTuple
 
 from fhaosmo_ros.core import Plant
-from fhaosmo_ros.tools.plot.figures import COLOURS, draw_band, TRUTH
+from fhaosmo_ros.tools.plot import COLOURS, draw_band, TRUE_STYLE
 from matplotlib.figure import Figure
 import numpy as np
 from studies.harness import discretised, Floats, Found, Results, run_study
@@ -143,7 +143,7 @@ def draw(t: Floats, d: Floats, noise: Floats, found: Estimates) -> Figure:
     top, middle, bottom = figure.subplots(3, 1, sharex=True, height_ratios=[2, 1, 1.6])
     pairs = ((top, d, found.d, 'estimated'), (middle, noise, found.noise, 'found'))
     for axes, truth, estimated, label in pairs:
-        axes.plot(t, truth, **TRUTH)
+        axes.plot(t, truth, **TRUE_STYLE)
         axes.plot(t, estimated, color=COLOURS[0], linewidth=1.0, label=label)
     draw_band(top, t, found.d, found.deviation)
     top.set(title='Unknown input', ylim=(1.5 * d.min(), 2.2 * d.max()))

@@ -6,10 +6,10 @@ from fhaosmo_ros.core import ConfigurationError, EventDetector, OnlineEstimator
 from fhaosmo_ros.core.observer.estimates import TUNING
 from fhaosmo_ros.core.observer.status import Status
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
+from fhaosmo_ros.tools import plot
 from fhaosmo_ros.tools.bags.reader import BagReader
 from fhaosmo_ros.tools.bags.topics import series
-from fhaosmo_ros.tools.plot import command as plot
-from fhaosmo_ros.tools.plot.curves import read_curves
+from fhaosmo_ros.tools.plot import read_curves
 from fhaosmo_ros.tools.replay import command as replay
 import numpy as np
 from observer_cases import states_of

@@ -3,12 +3,11 @@
 
 import bag_files as files
 from fhaosmo_ros.core import OnlineEstimator
+from fhaosmo_ros.tools import plot
 from fhaosmo_ros.tools.bags.topics import series
 from fhaosmo_ros.tools.bags.types import labelled_array
 from fhaosmo_ros.tools.demo import observers, OTHERS, report, START
-from fhaosmo_ros.tools.plot import command as plot
-from fhaosmo_ros.tools.plot.curves import read_curves
-from fhaosmo_ros.tools.plot.figures import COLUMNS, envelope
+from fhaosmo_ros.tools.plot import COLUMNS, envelope, read_curves
 from fhaosmo_ros.topics import ARRAY, FLOAT, TIME
 import numpy as np
 import pytest

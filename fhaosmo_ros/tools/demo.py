@@ -18,8 +18,7 @@ from fhaosmo_ros.tools.bags.topics import series
 from fhaosmo_ros.tools.bags.writer import BagWriter
 from fhaosmo_ros.tools.cli.command import output_at, progress, run_command, shipped
 from fhaosmo_ros.tools.cli.processes import start_node
-from fhaosmo_ros.tools.plot.curves import Curves, metrics, read_curves
-from fhaosmo_ros.tools.plot.figures import save_curves
+from fhaosmo_ros.tools.plot import Curves, metrics, read_curves, save_curves
 from fhaosmo_ros.topics import TRUTH
 import numpy as np
 

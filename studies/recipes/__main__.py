@@ -8,7 +8,7 @@ import sys
 from typing import Any
 
 from fhaosmo_ros.core import ConfigurationError
-from fhaosmo_ros.tools.plot.figures import COLOURS, draw_band, TRUTH
+from fhaosmo_ros.tools.plot import COLOURS, draw_band, TRUE_STYLE
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 import numpy as np
@@ -84,7 +84,7 @@ def _estimates(axes: Axes, recipe: Recipe, fold: Fold, rows: Mapping[str, Row]) 
     """Draw the truth, the estimates of some methods, and the self-tuning one's error band."""
     r, scale = fold.judged[0], recipe.scale
     part = (r.t - r.t[0] >= recipe.shown[0]) & (r.t - r.t[0] <= recipe.shown[1])
-    axes.plot(r.t[part], scale * r.d[part], **TRUTH)
+    axes.plot(r.t[part], scale * r.d[part], **TRUE_STYLE)
     for colour, (name, method) in zip(COLOURS, recipe.methods.items(), strict=False):
         if name not in recipe.drawn:
             continue
