@@ -3,10 +3,11 @@
 
 from bisect import bisect_left
 from collections import Counter
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Container, Iterator, Mapping
 from contextlib import contextmanager, ExitStack
 from io import BytesIO
-from itertools import zip_longest
+from itertools import pairwise
+from math import inf
 from mmap import ACCESS_READ, mmap
 from operator import itemgetter
 from pathlib import Path
@@ -101,10 +102,6 @@ class BagReader:
                     crc = int.from_bytes(summary[-12:-8], 'little')
                     if crc and crc32(summary[:-12]) != crc:
                         raise ValueError('the summary does not agree with its CRC')
-            stored = [c for storage in self._storages for c in storage.connections]
-            for topic in {c.topic for c in self.connections}:
-                there = sum(c.msgcount for c in stored if c.topic == topic)
-                _expect(topic, self.count(topic), there)
             self._stack = stack.pop_all()
 
     def __enter__(self) -> 'BagReader':
@@ -152,54 +149,52 @@ class BagReader:
 
         The publish time is 0 where it is not known, which only mcap has.
         """
+        wanted = {c.topic for c in self.connections} if topics is None else set(topics)
+        counts = dict.fromkeys(wanted, 0)
         with _readable(self.path):
             for storage in self._storages:
                 # By the storage's own connections: AnyReader.messages() yields nothing, and says
                 # nothing, where the QoS of metadata.yaml differs from the storage file's.
-                chosen = [c for c in storage.connections if topics is None or c.topic in topics]
-                if not chosen:  # rosbags takes that for all
-                    continue
-                names = {c.id: c.topic for c in chosen}
-                counts = dict.fromkeys(names, 0)
-                for time, published, number, data in self._rows(storage, chosen):
-                    counts[number] += 1
+                chosen = {c.id: c for c in storage.connections if c.topic in wanted}
+                for time, published, number, data in self._rows(storage, chosen) if chosen else ():
+                    topic = chosen[number].topic
+                    counts[topic] += 1
                     if data[: len(ZSTD)] == ZSTD:  # metadata.yaml says so, but it may be lost
                         data = zstandard.decompress(data)
-                    yield names[number], time, data, published
-                for c in chosen:
-                    _expect(c.topic, c.msgcount, counts[c.id])
+                    yield topic, time, data, published
+            for topic, there in counts.items():
+                if there != self.count(topic):
+                    listed = f'{self.count(topic)} are listed'
+                    raise ValueError(f'{there} messages on {topic} where {listed}')
 
-    def _rows(self, storage: Any, chosen: list[Connection]) -> Iterator[Row]:
+    def _rows(self, storage: Any, chosen: Mapping[int, Connection]) -> Iterator[Row]:
         """Yield messages by log time, with the publish time of mcap, which rosbags leaves out."""
         if not isinstance(storage, McapReader):
             self.unchecked = True
-            for c, stamp, data in storage.messages(chosen):
+            for c, stamp, data in storage.messages(chosen.values()):
                 yield stamp, 0, c.id, data
             return
         assert storage.bio
-        channels = {c.id for c in chosen}
         # Without message indexes it is not known which channels a chunk holds.
         parts = sorted(
             (c.message_start_time, c.chunk_start_offset, c.chunk_start_offset + c.chunk_length)
             for c in storage.chunks
-            if not c.channel_count or not channels.isdisjoint(c.channel_count)
+            if not c.channel_count or not chosen.keys().isdisjoint(c.channel_count)
         )
         if not storage.chunks:  # all is kept in memory, to put it in order
             parts = [(0, storage.data_start, storage.data_end)]
         rows: list[Row] = []
         with mmap(storage.bio.fileno(), 0, access=ACCESS_READ) as file:
-            for (_, begin, end), following in zip_longest(parts, parts[1:]):
-                rows += self._messages(file, begin, end, channels)
+            for (_, begin, end), (following, *_) in pairwise([*parts, (inf, 0, 0)]):
+                rows += self._messages(file, begin, end, chosen)
                 rows.sort(key=itemgetter(0))
                 # Chunks may overlap: what lies behind the next one's begin has to wait.
-                ready = len(rows)
-                if following:
-                    ready = bisect_left(rows, following[0], key=itemgetter(0))
+                ready = bisect_left(rows, following, key=itemgetter(0))
                 yield from rows[:ready]
                 del rows[:ready]
 
     def _messages(
-        self, data: bytes | mmap, at: int, end: int, channels: Collection[int]
+        self, data: bytes | mmap, at: int, end: int, chosen: Container[int]
     ) -> Iterator[Row]:
         """Yield the messages in some records of an mcap file, also those in chunks."""
         of_messages = int(Opcode.MESSAGE)  # which is quicker to compare with
@@ -210,13 +205,13 @@ class BagReader:
                 raise ValueError('a record goes beyond the end of its chunk')
             if opcode == of_messages:
                 channel, _, logged, published = MESSAGE.unpack_from(data, begin)
-                if channel in channels:
+                if channel in chosen:
                     yield logged, published, channel, data[begin + MESSAGE.size : at]
             elif opcode == Opcode.CHUNK:
                 chunk = Chunk.read(ReadDataStream(BytesIO(data[begin:at])))
                 self.unchecked |= not chunk.uncompressed_crc
                 stream, size = get_chunk_data_stream(chunk, validate_crc=True)
-                yield from self._messages(stream.read(size), 0, size, channels)
+                yield from self._messages(stream.read(size), 0, size, chosen)
             elif opcode == Opcode.DATA_END:
                 crc = int.from_bytes(data[begin:at], 'little')
                 self.unchecked |= not crc
@@ -292,12 +287,6 @@ class BagReader:
         with _readable(self.path):  # a damaged count may ask for more memory than there is
             table = np.fromiter(bar, kinds)
         return FieldSamples(*(np.ascontiguousarray(table[name]) for name, _ in kinds))
-
-
-def _expect(topic: str, listed: int, there: int) -> None:
-    """Compare the messages that are there with those that metadata or index list."""
-    if there != listed:
-        raise ValueError(f'{there} messages on {topic} where {listed} are listed')
 
 
 def _expect_bag(path: Path) -> None:
