@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
-from fhaosmo_ros.tools.bags.types import serialise, with_numbers
+from fhaosmo_ros.tools.bags.types import serialise
 from fhaosmo_ros.tools.bags.writer import BagWriter
 from fhaosmo_ros.topics import FLOAT
 import numpy as np
@@ -76,7 +76,7 @@ def bag_of_table(path: Path, wanted: str, used: Sequence[str], bag: Path) -> Non
             'counted from 0'
         )
     empty = serialise(FLOAT, data=0.0)
-    messages = {f'/{n}': with_numbers(empty, x) for n, x in zip(names[1:], numbers, strict=True)}
+    messages = {f'/{n}': (empty, x) for n, x in zip(names[1:], numbers, strict=True)}
     with BagWriter(bag) as writer:
         for topic in messages:
             writer.add(topic, FLOAT)

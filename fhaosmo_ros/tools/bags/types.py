@@ -45,23 +45,6 @@ def serialise(message_type: str, **fields: Any) -> bytes:
     return bytes(TYPES.serialize_cdr(TYPES.types[message_type](**fields), message_type))
 
 
-def with_numbers(message: bytes, numbers: NDArray[Any]) -> NDArray[np.uint8]:
-    """
-    Return a message for each row of numbers, (K, size), all at once.
-
-    Parameters
-    ----------
-    message : bytes
-        In CDR; it ends with the numbers, of the same type, which those of a row replace.
-    numbers : (K,) or (K, m) array
-
-    """
-    rows = np.ascontiguousarray(numbers).reshape(len(numbers), -1)
-    ends = rows.view(np.uint8).reshape(len(rows), -1)
-    begin = np.frombuffer(message[: len(message) - ends.shape[1]], np.uint8)
-    return np.hstack([np.tile(begin, (len(rows), 1)), ends])
-
-
 def labelled_array(names: list[str], values: NDArray[np.float64]) -> bytes:
     """Return a Float64MultiArray in CDR whose label lists its elements, as the nodes publish."""
     types, count = TYPES.types, len(names)

@@ -11,9 +11,10 @@ from collections.abc import Mapping, Sequence
 from copy import deepcopy
 import os
 from pathlib import Path
+from struct import Struct
 from typing import Any, NamedTuple
 
-from fhaosmo_ros.tools.bags.reader import BagReader, MESSAGE, RECORD
+from fhaosmo_ros.tools.bags.reader import BagReader, MESSAGE
 from fhaosmo_ros.tools.bags.types import learn, OFFERED_QOS, TYPES
 from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
@@ -26,6 +27,8 @@ import yaml
 
 CHUNK_SIZE = 1 << 20
 """Bytes of messages after which a chunk of mcap is closed."""
+HEAD = Struct('<BQHIQQ')
+"""In front of a message in CDR: that of a record, and that of `MESSAGE`."""
 
 
 class _Index(NamedTuple):
@@ -123,14 +126,13 @@ class BagWriter:
         """
         channel, sent = self._channels[topic], stamp if published is None else published
         self._rows.append((channel, stamp, len(self._data)))
-        self._data += RECORD.pack(Opcode.MESSAGE, MESSAGE.size + len(data))
-        self._data += MESSAGE.pack(channel, 0, stamp, sent)
+        self._data += HEAD.pack(Opcode.MESSAGE, MESSAGE.size + len(data), channel, 0, stamp, sent)
         self._data += data
         if len(self._data) > CHUNK_SIZE:
             self.flush()
 
     def write_columns(
-        self, times: NDArray[np.int64], columns: Mapping[str, NDArray[np.uint8]]
+        self, times: NDArray[np.int64], columns: Mapping[str, tuple[bytes, NDArray[Any]]]
     ) -> None:
         """
         Append a message of each topic at each time, all at once.
@@ -139,26 +141,29 @@ class BagWriter:
         ----------
         times : (K,) array of int
             In nanoseconds.
-        columns : mapping of str to (K, size) array
-            The bytes of the messages of each topic in CDR.
+        columns : mapping of str to (bytes, (K,) or (K, m) array)
+            Of each topic a message in CDR that ends with numbers, and the numbers, of the same
+            type, that stand there at each time.
 
         """
         self.flush()
-        stamps = times.astype('<i8').view(np.uint8).reshape(len(times), -1)
         channels = [self._channels[topic] for topic in columns]
-        parts, places, width = [], [], 0
-        for channel, messages in zip(channels, columns.values(), strict=True):
-            size = MESSAGE.size + messages.shape[1]
-            head = RECORD.pack(Opcode.MESSAGE, size) + MESSAGE.pack(channel, 0, 0, 0)[:-16]
-            heads = np.tile(np.frombuffer(head, np.uint8), (len(times), 1))
-            parts += [heads, stamps, stamps, messages]
-            places.append(width)
-            width += RECORD.size + size
-        starts = width * np.arange(len(times))[:, np.newaxis] + places
-        rows = [np.tile(channels, len(times)), np.repeat(times, len(channels)), starts.ravel()]
-        self._write_chunk(np.hstack(parts).tobytes(), np.column_stack(rows))
+        line, ends = b'', []  # what is written at a time, and where its messages end
+        for channel, (message, _) in zip(channels, columns.values(), strict=True):
+            size = MESSAGE.size + len(message)
+            line += HEAD.pack(Opcode.MESSAGE, size, channel, 0, 0, 0) + message
+            ends.append(len(line))
+        lines = np.tile(np.frombuffer(line, np.uint8), (len(times), 1))
+        stamps = _in_bytes(np.column_stack([times, times]))
+        for end, (message, numbers) in zip(ends, columns.values(), strict=True):
+            begin, last = end - len(message), _in_bytes(numbers)
+            lines[:, begin - stamps.shape[1] : begin] = stamps
+            lines[:, end - last.shape[1] : end] = last
+        places = len(line) * np.arange(len(times))[:, np.newaxis] + [0, *ends[:-1]]
+        rows = [np.tile(channels, len(times)), np.repeat(times, len(channels)), places.ravel()]
+        self._write_chunk(lines.data, np.column_stack(rows))
 
-    def _write_chunk(self, data: bytes, rows: NDArray[np.int64]) -> None:
+    def _write_chunk(self, data: bytes | memoryview, rows: NDArray[np.int64]) -> None:
         """Write message records as a chunk: what `Writer.add_message` does for each of them."""
         chunk, statistics = self._writer._Writer__chunk_builder, self._statistics
         first, last = int(rows[:, 1].min()), int(rows[:, 1].max())
@@ -225,3 +230,8 @@ class BagWriter:
             'files': [{'path': name, **deepcopy(span)}], 'custom_data': None,
             'ros_distro': os.environ.get('ROS_DISTRO') or 'jazzy',
         }  # fmt: skip
+
+
+def _in_bytes(rows: NDArray[Any]) -> NDArray[np.uint8]:
+    """Return the bytes of each row of numbers."""
+    return np.ascontiguousarray(rows).view(np.uint8).reshape(len(rows), -1)

@@ -145,7 +145,7 @@ def bag_sink(
                 'stamp': np.column_stack(np.divmod(e.t, 1_000_000_000)).astype('<i4'),
             }  # fmt: skip
             bag.write_columns(rows.times, {
-                f'{name}/{topic}': types.with_numbers(message, found[topic])
+                f'{name}/{topic}': (message, found[topic])
                 for topic, message in empty.items()
             })  # fmt: skip
             for time, event in rows.events:
