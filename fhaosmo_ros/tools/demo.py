@@ -195,10 +195,10 @@ def report(curves: list[Curves], marks: Sequence[tuple[int, str]]) -> str:
     origin = curves[0].stamps[0]
     t = (curves[0].stamps - origin) * 1e-9
     edges = [START, *((stamp - origin) * 1e-9 for stamp, _ in marks), np.inf]
-    parts = {begin: (t >= begin) & (t < end) for begin, end in pairwise(edges)}
-    parts = {begin: part for begin, part in parts.items() if part.any()} or {0.0: t >= 0.0}
-    tables = [
-        metrics([c.part(part) for c in curves], f'from {begin:.0f} s')
-        for begin, part in parts.items()
-    ]
+    tables = []
+    for begin, end in pairwise(edges):
+        part = (t >= begin) & (t < end)
+        if part.any():
+            tables.append(metrics([c.part(part) for c in curves], f'from {begin:.0f} s'))
+    tables = tables or [metrics(curves, 'from 0 s')]
     return '\n\n'.join([*tables, WORDS] if curves[1:] else tables)

@@ -188,6 +188,8 @@ class BagReader:
             for (_, begin, end), (following, *_) in pairwise([*parts, (inf, 0, 0)]):
                 rows += self._messages(file, begin, end, chosen)
                 rows.sort(key=itemgetter(0))
+                if rows and rows[-1][0] >= 2**63:  # it would not fit into arrays
+                    raise ValueError('a stamp beyond the year 2262')
                 # Chunks may overlap: what lies behind the next one's begin has to wait.
                 ready = bisect_left(rows, following, key=itemgetter(0))
                 yield from rows[:ready]

@@ -195,8 +195,6 @@ class BagWriter:
             data, rows = bytes(self._data), np.array(self._rows, dtype=np.int64)
             self._data, self._rows = bytearray(), []
             self._write_chunk(data, rows)
-        else:
-            self._writer.flush()
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         with self._file:

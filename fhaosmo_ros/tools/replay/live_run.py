@@ -21,11 +21,6 @@ AGREEMENT = 1e-12
 """Relative or absolute difference up to which two memories count as the same."""
 COMPARED = 'z_hat', 'z_tilde', 'p', 'q', 'gamma', 'y', 'pending'
 """What snapshots of every version hold of a state."""
-KINDS = (
-    '', 'bool', 'integer', 'double', 'string', 'byte_array', 'bool_array', 'integer_array',
-    'double_array', 'string_array',
-)  # fmt: skip
-"""Of a rcl_interfaces/msg/ParameterValue, by number: the value is in the field KIND_value."""
 
 
 class Event(NamedTuple):
@@ -201,8 +196,9 @@ def _read_events(reader: BagReader, name: str, fixed: Collection[str]) -> list[E
                 for parameter in message.changed_parameters:
                     of_channel, key = split(parameter.name)
                     if of_channel == channel and key in ONLINE_PARAMETERS and key not in fixed:
-                        value = getattr(parameter.value, f'{KINDS[parameter.value.type]}_value')
-                        changes[key] = ONLINE_PARAMETERS[key].coerce(value)
+                        # The number of the type, and behind it a value of each type in order.
+                        given = [*vars(parameter.value).values()]
+                        changes[key] = ONLINE_PARAMETERS[key].coerce(given[given[0]])
             continue
         try:
             snapshot = unpack(message.data, message.layout.dim[0].label.split(','))
