@@ -52,7 +52,7 @@ def run(name: str, arguments: list[str] | None = None) -> int:
     """Run a command and return its exit code."""
     # While it loads, nothing has begun. These handlers also end a process that was started with
     # SIGINT ignored; the command sets its own.
-    code = 0 if COMMANDS[name][0].startswith('fhaosmo_ros.nodes.') else 130
+    code = 0 if COMMANDS[name][0].startswith('.nodes.') else 130
     for number in ending_signals():
         signal.signal(number, lambda *_: os._exit(code))
     told: set[str] = set()
@@ -69,7 +69,7 @@ def run(name: str, arguments: list[str] | None = None) -> int:
     try:
         # Imported only now: a node needs ROS, and the help must not wait for numpy.
         gc.disable()  # nearly all that an import makes stays; looking for garbage takes 0.1 s
-        module = importlib.import_module(COMMANDS[name][0])
+        module = importlib.import_module(COMMANDS[name][0], 'fhaosmo_ros')
         gc.freeze()
         gc.enable()
         return int(module.main(arguments))

@@ -127,15 +127,13 @@ class LiveRun:
             stamp, flags, values = event.snapshot
             # If the bag lacks that sample, the event takes place before the next one.
             at, found = _find(stamps, position, stamp)
+            begins = at if flags & Flag.STARTED else at + found
+            yield slice(position, begins)
+            self._configure(event.changes)
             if flags & Flag.STARTED:
-                yield slice(position, at)
-                position = at
-                self._configure(event.changes)
                 estimator.reset()
-            yield slice(position, at + found)
             position = at + found
-            if not flags & Flag.STARTED:
-                self._configure(event.changes)
+            yield slice(begins, position)
             if flags & Flag.RESET:
                 estimator.reset()
             estimator.freeze(bool(np.any(values.get('frozen', False))))

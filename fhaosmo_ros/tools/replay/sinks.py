@@ -7,6 +7,7 @@ import csv
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from fhaosmo_ros import topics
 from fhaosmo_ros.core.observer.estimates import Trajectory, TUNING
 from fhaosmo_ros.core.observer.observer import Observer
 from fhaosmo_ros.core.online.events import described, Event
@@ -15,16 +16,6 @@ from fhaosmo_ros.core.parameters.units import derivative_unit
 from fhaosmo_ros.tools.bags import types
 from fhaosmo_ros.tools.bags.reader import BagReader
 from fhaosmo_ros.tools.bags.writer import BagWriter
-from fhaosmo_ros.topics import (
-    ARRAY,
-    DIAGNOSTICS,
-    estimates_of,
-    EVENT,
-    PARAMETERS,
-    STANDARD_DEVIATION,
-    TEXT,
-    TIME,
-)
 import numpy as np
 from numpy.typing import NDArray
 
@@ -114,46 +105,43 @@ def bag_sink(
         Parameters of the estimates; written once, as the node publishes them.
 
     """
-    text: bytes | None = types.serialise(TEXT, data=dumps(parameters, name))
+    text: bytes | None = types.serialise(topics.TEXT, data=dumps(parameters, name))
     unit = derivative_unit(parameters['measurement_unit'], observer.order)
     state = [f'z{i + 1}' for i in range(observer.order)]
     labels = {
         'state': state, 'innovation': [f'eps{i + 1}' for i in range(observer.levels)],
-        STANDARD_DEVIATION: [*state, 'd'], 'tuning': TUNING,
+        topics.STANDARD_DEVIATION: [*state, 'd'], 'tuning': TUNING,
     }  # fmt: skip
     empty = {}
     with BagWriter(path) as bag:
-        bag.add(f'{name}/{PARAMETERS}', TEXT, qos=[types.LATCHED_QOS])
-        for topic, kind in estimates_of(parameters).items():
+        bag.add(f'{name}/{topics.PARAMETERS}', topics.TEXT, qos=[types.LATCHED_QOS])
+        for topic, kind in topics.estimates_of(parameters).items():
             bag.add(f'{name}/{topic}', kind)
-            if kind == ARRAY:
+            if kind == topics.ARRAY:
                 empty[topic] = types.labelled_array(labels[topic], np.zeros(len(labels[topic])))
             else:
-                fields = {'sec': 0, 'nanosec': 0} if kind == TIME else {'data': 0.0}
+                fields = {'sec': 0, 'nanosec': 0} if kind == topics.TIME else {'data': 0.0}
                 empty[topic] = types.serialise(kind, **fields)
         bag.copy(reader)
 
         def write(rows: Rows) -> None:
             nonlocal text
             if text:
-                bag.write(f'{name}/{PARAMETERS}', int(rows.times[0]), text)
+                bag.write(f'{name}/{topics.PARAMETERS}', int(rows.times[0]), text)
                 text = None
             e = rows.estimates
-            found = {
-                'gamma': e.gamma, STANDARD_DEVIATION: e.standard_deviation, 'tuning': e.tuning,
-                'state': e.z, 'unknown_input': e.unknown_input, 'innovation': e.innovation,
-                'stamp': np.column_stack(np.divmod(e.t, 1_000_000_000)).astype('<i4'),
-            }  # fmt: skip
+            stamps = np.column_stack(np.divmod(e.t, 1_000_000_000)).astype('<i4')
+            found = {**e._asdict(), 'state': e.z, 'stamp': stamps}  # others have their own names
             bag.write_columns(rows.times, {
                 f'{name}/{topic}': (message, found[topic])
                 for topic, message in empty.items()
             })  # fmt: skip
             for time, event in rows.events:
-                bag.add(f'{name}/{EVENT}', DIAGNOSTICS, qos=[types.LATCHED_QOS])
+                bag.add(f'{name}/{topics.EVENT}', topics.DIAGNOSTICS, qos=[types.LATCHED_QOS])
                 status = f'{name.lstrip("/")}: event'
                 message = types.diagnostics(
                     event.stamp, event.begins, status, *described(event, unit)
                 )
-                bag.write(f'{name}/{EVENT}', time, message)
+                bag.write(f'{name}/{topics.EVENT}', time, message)
 
         yield write
