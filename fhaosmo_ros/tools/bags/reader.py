@@ -156,16 +156,17 @@ class BagReader:
                 # By the storage's own connections: AnyReader.messages() yields nothing, and says
                 # nothing, where the QoS of metadata.yaml differs from the storage file's.
                 chosen = {c.id: c for c in storage.connections if c.topic in wanted}
-                for time, published, number, data in self._rows(storage, chosen) if chosen else ():
+                if not chosen:  # rosbags takes that for all
+                    continue
+                for time, published, number, data in self._rows(storage, chosen):
                     topic = chosen[number].topic
                     counts[topic] += 1
                     if data[: len(ZSTD)] == ZSTD:  # metadata.yaml says so, but it may be lost
                         data = zstandard.decompress(data)
                     yield topic, time, data, published
             for topic, there in counts.items():
-                if there != self.count(topic):
-                    listed = f'{self.count(topic)} are listed'
-                    raise ValueError(f'{there} messages on {topic} where {listed}')
+                if (listed := self.count(topic)) != there:
+                    raise ValueError(f'{there} messages on {topic} where {listed} are listed')
 
     def _rows(self, storage: Any, chosen: Mapping[int, Connection]) -> Iterator[Row]:
         """Yield messages by log time, with the publish time of mcap, which rosbags leaves out."""

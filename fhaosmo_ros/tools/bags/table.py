@@ -43,7 +43,7 @@ def bag_of_table(path: Path, wanted: str, used: Sequence[str], bag: Path) -> Non
 
     """
     names = ['the time', 'y', *used]
-    with path.open(encoding='utf-8-sig') as file:
+    with path.open(encoding='utf-8-sig', errors='replace') as file:
         lines = file.readlines()
     if not any(map(str.strip, lines)):
         raise ConfigurationError(f'{path}: expected lines of numbers, got an empty file')

@@ -42,7 +42,7 @@ def series(path: Path, topic: str) -> Series:
     """
     stamps, values = [np.zeros(0, np.int64)], []
     with BagReader(path) as reader:
-        rows = reader.objects([topic]) if reader.count(topic) else iter(())
+        rows = reader.objects([topic])
         while block := list(islice(rows, BLOCK)):  # arrays take less memory than messages
             stamps.append(np.array([stamp for _, stamp, _, _ in block]))
             try:

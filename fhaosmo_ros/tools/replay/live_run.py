@@ -186,8 +186,7 @@ def _read_events(reader: BagReader, name: str, fixed: Collection[str]) -> list[E
     """Return the events of a live estimator in order."""
     events: list[Event] = []
     changes: dict[str, Any] = {}
-    topics = {f'{name}/{SNAPSHOT}', EVENTS} & {c.topic for c in reader.connections}
-    for topic, _, message in reader.read_all(topics):
+    for topic, _, message in reader.read_all([f'{name}/{SNAPSHOT}', EVENTS]):
         if topic == EVENTS:
             node, channel = message.node, name.removeprefix(message.node).strip('/')
             if name == node or name.startswith(f'{node}/'):
