@@ -86,8 +86,9 @@ def test_every_storage_and_compression_is_read(storage, compression, version, tm
 @pytest.mark.parametrize('preset', ['plain', 'fastwrite'])
 def test_messages_and_chunks_out_of_order_are_put_in_order(preset, tmp_path):
     order = np.argsort(np.arange(COUNT) + np.random.default_rng(3).uniform(0, 700, COUNT))
-    shuffled = [FLOATS[k] for k in order]
-    assert read(files.write_preset(tmp_path / 'bag', shuffled, preset)) == COUNT
+    assert read(files.write_preset(tmp_path / 'bag', [FLOATS[k] for k in order], preset)) == COUNT
+    damaged = files.write_preset(tmp_path / 'late', [('/y', files.FLOAT, 2**63, b'')], preset)
+    assert read(damaged) is None
 
 
 def test_bag_whose_qos_differs_from_its_storage_is_read(tmp_path):

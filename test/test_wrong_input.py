@@ -93,7 +93,7 @@ def place(tmp_path_factory):
         writer.write(x, 5, files.float64(1.0))
     files.write(place / 'joints', [('/y', files.JOINTS, 5, files.joint_state(5, [1.0, 2.0, 3.0]))])
     (place / 'three.urdf').write_text(URDF)
-    (place / 'text.csv').write_text('t,y,u\n0,1,2\n0.001,x,3\n')
+    (place / 'text.csv').write_bytes(b't,y,u\n0,1,2\n0.001,\xff,3\n')
     (place / 'late.csv').write_text('t,angle,u\nnan,1,2\n')
     (place / 'none.csv').touch()
     (place / 'lamda.yaml').write_text('estimator: {ros__parameters: {lamda: 1.0}}')
