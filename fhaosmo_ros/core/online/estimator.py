@@ -31,8 +31,6 @@ SILENCE, SILENT_SAMPLES = 0.5, 5
 """Seconds, and usual intervals, after which y is said to be silent; the larger of both."""
 LARGEST_STAMP = 2**63 - 1
 Ints = NDArray[np.int64]
-Change = tuple[Parameters, ObserverConfiguration]
-"""A live change of parameters that has been checked; see `OnlineEstimator.prepare`."""
 
 
 class OnlineEstimator:
@@ -74,16 +72,10 @@ class OnlineEstimator:
     def __init__(self, parameters: Mapping[str, Any] | None = None, /, **named: Any) -> None:
         given = ESTIMATOR_PARAMETERS.complete(parameters, named)
         p = self._parameters = ONLINE_PARAMETERS.complete(given)
-        self.observer = Observer(p)
-        if p['input_delay'] > p['measurement_delay']:
-            raise ConfigurationError(
-                "parameters 'input_delay', 'measurement_delay': expected each at most the next "
-                f'one, got {p["input_delay"]} and {p["measurement_delay"]}'
-            )
-        check_events(p)
+        self.observer, smooths = Observer(p), p['smoothing_lag'] > 0.0
+        _check(p, self.observer.configuration, smooths)
         self.smoothing: Smoother | None = None
-        if p['smoothing_lag'] > 0.0:
-            _check_smoothing(p, self.observer.configuration)
+        if smooths:
             self.smoothing = Smoother(self.observer, round(p['smoothing_lag'] / NANOSECONDS))
         self.policy = Policy(self.observer.structure, self._settings(p))
         self.events = EventDetector(p)
@@ -138,27 +130,12 @@ class OnlineEstimator:
         """What y is taken to be too large by, since a jump that the model contradicts (D 23)."""
         return float(self.observer.structure.memory['offset'])
 
-    def prepare(self, changes: Mapping[str, Any]) -> Change:
-        """Return what `adopt` takes for these changes; raise as `configure`, change nothing."""
+    def prepare(self, changes: Mapping[str, Any]) -> tuple[Parameters, ObserverConfiguration]:
+        """Return what follows from these changes; raise as `configure`, change nothing."""
         parameters = self._parameters.changed_live(changes, 'observer')
         configuration = ObserverConfiguration(parameters)
-        check_events(parameters)
-        if self.smoothing is not None:
-            _check_smoothing(parameters, configuration)
+        _check(parameters, configuration, self.smoothing is not None)
         return parameters, configuration
-
-    def adopt(self, change: Change) -> None:
-        """Go on with a change that `prepare` has returned, from the next sample on."""
-        (parameters, configuration), before = change, self._parameters
-        with self.policy:
-            self.observer.adopt(configuration)
-            self.policy.configure(self.observer.structure, self._settings(parameters))
-            self._parameters = parameters
-            if self.smoothing is not None:
-                self.smoothing.configure()
-            self.events.configure(parameters)
-            if parameters['sampling'] != before['sampling']:  # stamps of another clock
-                self.policy.change(timed=False, tick_count=0)
 
     def configure(self, changes: Mapping[str, Any]) -> None:
         """
@@ -170,7 +147,16 @@ class OnlineEstimator:
             An unknown name, a bad value, or a parameter that can't change live.
 
         """
-        self.adopt(self.prepare(changes))
+        parameters, configuration = self.prepare(changes)
+        with self.policy:
+            if parameters['sampling'] != self._parameters['sampling']:  # stamps of another clock
+                self.policy.change(timed=False, tick_count=0)
+            self.observer.adopt(configuration)
+            self.policy.configure(self.observer.structure, self._settings(parameters))
+            self.events.configure(parameters)
+            if self.smoothing is not None:
+                self.smoothing.configure()
+            self._parameters = parameters
 
     def _settings(self, p: Mapping[str, Any]) -> dict[str, Any]:
         """Return what the policy reads of parameters; times in nanoseconds."""
@@ -198,7 +184,8 @@ class OnlineEstimator:
         with self.policy:
             self.policy.reset()
             self.events.reset()
-            self._cut()
+            if self.smoothing is not None:
+                self.smoothing.cut()
 
     def smooth(self) -> None:
         """
@@ -213,7 +200,7 @@ class OnlineEstimator:
             `noise_size` is 0, which says how much to trust a sample; or `predict_to_now`.
 
         """
-        _check_smoothing(self._parameters, self.observer.configuration)
+        _check(self._parameters, self.observer.configuration, smooths=True)
         self.smoothing = Smoother(self.observer)
 
     def finish(self) -> Trajectory:
@@ -264,12 +251,8 @@ class OnlineEstimator:
             self.observer.structure.load_state_dict(values)
             self.policy.change(**own)
             self.events.memory = Progress(**events)
-            self._cut()
-
-    def _cut(self) -> None:
-        """Smooth nothing across what has happened."""
-        if self.smoothing is not None:
-            self.smoothing.cut()
+            if self.smoothing is not None:
+                self.smoothing.cut()
 
     def freeze(self, held: bool) -> None:
         """Hold gamma where it is, or let it adapt again; no parameter changes."""
@@ -379,17 +362,11 @@ class OnlineEstimator:
             raise ConfigurationError(
                 f'run: expected stamps in nanoseconds, which are integers, got {stamps.dtype}'
             )
-        stamps, count = stamps.astype(np.int64, copy=False), len(y)
-        held = self.policy.arrays['u']
-        inputs = np.tile(held, (count, 1))
-        if u is not None:
-            inputs = known_inputs(u, self.observer.inputs, count)
-            for k, j in np.argwhere(~np.isfinite(inputs)):
-                inputs[k, j] = inputs[k - 1, j] if k else held[j]
-                self.reject_inputs(1)
-        if count:
-            held[:] = inputs[-1]
-        return self._run(stamps, y, inputs)
+        if u is None:
+            inputs = np.tile(self.policy.arrays['u'], (len(y), 1))
+        else:
+            inputs = known_inputs(u, self.observer.inputs, len(y))
+        return self._run(stamps.astype(np.int64, copy=False), y, inputs)
 
     def _run(self, stamps: Ints, y: NDArray[np.float64], u: NDArray[np.float64]) -> Trajectory:
         """Take samples with their known inputs, and look at them for events and for smoothing."""
@@ -434,11 +411,18 @@ class OnlineEstimator:
         return self.observer.tuning
 
 
-def _check_smoothing(p: Mapping[str, Any], configuration: ObserverConfiguration) -> None:
-    """Raise ConfigurationError where estimates can not be smoothed."""
-    if p['predict_to_now']:
+def _check(p: Mapping[str, Any], configuration: ObserverConfiguration, smooths: bool) -> None:
+    """Raise ConfigurationError where values do not fit together, also for who `smooths`."""
+    if p['input_delay'] > p['measurement_delay']:
+        raise ConfigurationError(
+            "parameters 'input_delay', 'measurement_delay': expected each at most the next one, "
+            f'got {p["input_delay"]} and {p["measurement_delay"]}'
+        )
+    check_events(p)
+    if smooths and p['predict_to_now']:
         raise ConfigurationError(
             "smoothing, 'predict_to_now': expected estimates of the past or of the present, "
             'got both'
         )
-    Passes(configuration)
+    if smooths:
+        Passes(configuration)

@@ -179,8 +179,8 @@ cdef class Policy:
 
     # One sample
 
-    cdef int take(self, long long stamp, double y, const double* u) noexcept nogil:
-        """Take any stamp (ns) and y with finite known inputs (m,); return a status word."""
+    cdef int take(self, long long stamp, double y) noexcept nogil:
+        """Take any stamp (ns) and y with the known inputs that are held; return a status word."""
         cdef Course* course = &self.course
         cdef Memory* memory = &self.structure.memory
         cdef long long now = stamp, elapsed = 0
@@ -194,11 +194,13 @@ cdef class Policy:
         if not word and not isnan(memory.y):
             elapsed = self.since_latest(now, y, &word)
         if elapsed > 0:
-            word |= self.step_to(elapsed, y, u)
+            self.find_acting(elapsed)
+            word |= self.step_over(elapsed, y)
         elif not word & UNUSED:  # first sample, or first after a restart
             word |= self.structure.start(y)
             self.begin_time(now, now)
         if elapsed > 0 and not word & REJECTED_SPIKE:
+            self.note(elapsed)
             course.latest = now
             if word & DIVERGED:
                 course.lost = False
@@ -208,7 +210,7 @@ cdef class Policy:
                 word = word & (FLAGS_MASK ^ REJECTED_STEP) | DIVERGED | self.structure.measure(y)
         if not word & UNUSED:
             course.valid = True
-            memcpy(&self.present[0], u, self.structure.inputs * sizeof(double))
+            self.present[:] = self.held
             course.stamp = stamp if self.settings.nominal else now
         elif not word & REJECTED_STEP:  # the estimate stays that of the latest sample
             if word & JUMPED:  # z_1 has followed y, and only the next sample gives it a time
@@ -425,50 +427,41 @@ cdef class Policy:
 
     # Steps
 
-    cdef int step_to(self, long long elapsed, double y, const double* u) noexcept nogil:
-        """Step to a sample with the inputs that acted until it was measured."""
-        cdef int word
-        if self.settings.lag > 0:
-            self.find_acting(elapsed, u)
-        else:
-            memcpy(self.acting, u, self.structure.inputs * sizeof(double))
-        word = self.step_over(elapsed, y, self.acting)
-        if self.settings.lag > 0 and not word & REJECTED_SPIKE:
-            self.note(elapsed, u)
-        return word
-
     cdef double* piece(self, int back) noexcept nogil:
         """Return a piece, by its number from the latest one back."""
         cdef int place = (self.course.past_place + MOST_PIECES - back) % MOST_PIECES
         return &self.pieces[place, 0]
 
-    cdef void note(self, long long elapsed, const double* u) noexcept nogil:
-        """Append that the inputs have been `u` for the latest `elapsed` nanoseconds."""
-        cdef double* latest = self.piece(0)
+    cdef void note(self, long long elapsed) noexcept nogil:
+        """Remember that the inputs have been what they are for the latest `elapsed` ns."""
+        cdef double* latest
         cdef bint same = self.course.past_count > 0
         cdef int j
+        if self.settings.lag == 0:
+            return
+        latest = self.piece(0)
         for j in range(self.structure.inputs):
-            same = same and latest[1 + j] == u[j]
+            same = same and latest[1 + j] == self.held[j]
         if not same:
             self.course.past_place = (self.course.past_place + 1) % MOST_PIECES
             self.course.past_count = min(self.course.past_count + 1, MOST_PIECES)
             latest = self.piece(0)
             latest[0] = 0.0
-            memcpy(latest + 1, u, self.structure.inputs * sizeof(double))
+            memcpy(latest + 1, &self.held[0], self.structure.inputs * sizeof(double))
         latest[0] += elapsed
 
-    cdef void find_acting(self, long long elapsed, const double* u) noexcept nogil:
+    cdef void find_acting(self, long long elapsed) noexcept nogil:
         """
         Write the mean of the inputs over `elapsed` nanoseconds that ended the lag before now.
 
-        They have been `u` for the latest `elapsed` nanoseconds, which are no piece yet.
+        For the latest `elapsed` nanoseconds, which are no piece yet, they are those that are held.
         """
         cdef long long lag = self.settings.lag, age = elapsed, younger, share
         cdef long long covered = max(elapsed - lag, 0)
         cdef const double* piece
         cdef int count = self.course.past_count, k, j
         for j in range(self.structure.inputs):
-            self.acting[j] = u[j] if covered > 0 or count == 0 else 0.0
+            self.acting[j] = self.held[j] if covered > 0 or count == 0 else 0.0
         for k in range(count):
             if covered >= elapsed:
                 return
@@ -482,7 +475,7 @@ cdef class Policy:
                 for j in range(self.structure.inputs):
                     self.acting[j] += <double>share / covered * (piece[1 + j] - self.acting[j])
 
-    cdef int step_over(self, long long elapsed, double y, const double* u) noexcept nogil:
+    cdef int step_over(self, long long elapsed, double y) noexcept nogil:
         """
         Step to a sample `elapsed` later, through a gap in sub-steps; return the status word.
 
@@ -505,7 +498,7 @@ cdef class Policy:
         if count > 1 or self.settings.gate > 0.0:
             self.structure.begin_at_estimates()
             for _ in range(count):
-                self.structure.prediction.step(h, u)
+                self.structure.prediction.step(h, self.acting)
             end = self.structure.prediction.z[0]
             modelled = fabs(end) <= LIMIT  # False for NaN
             if not modelled:
@@ -518,9 +511,9 @@ cdef class Policy:
             sample = y
             if k < count:  # then the scheme leaves the prediction alone
                 if modelled:
-                    self.structure.prediction.step(h, u)
+                    self.structure.prediction.step(h, self.acting)
                 sample = self.structure.prediction.z[0] + k * bend + memory.offset
-            word = word & FLAGS_MASK | self.structure.step(sample, h, u)
+            word = word & FLAGS_MASK | self.structure.step(sample, h, self.acting)
             if word & REJECTED:
                 break
             if self.course.frozen:
@@ -604,17 +597,18 @@ cdef class Policy:
     def advance(self, long long stamp, double y):
         """Take a sample with the known inputs that are held; return the status word."""
         self.enter()
-        return self.take(stamp, y, &self.held[0])
+        return self.take(stamp, y)
 
     def run(self, const long long[::1] stamps, const double[::1] y, const double[:, ::1] u):
         """
         Take K samples; return their record and arrays with a row for each of them.
 
         These are z and d where they are carried to the present (else there are no rows), times of
-        the observer, and the inputs that acted in the latest step until then.
+        the observer, and the inputs that acted in the latest step until then. Instead of a known
+        input that is not finite the one before is held.
         """
         cdef Structure structure = self.structure
-        cdef Py_ssize_t k, count = y.shape[0], m = structure.inputs
+        cdef Py_ssize_t k, j, count = y.shape[0], m = structure.inputs
         cdef Record record = Record(structure, count)
         cdef bint carried = self.settings.to_now and self.settings.delay > 0
         cdef double[:, ::1] present = np.empty((count * carried, structure.order + 1))
@@ -627,7 +621,12 @@ cdef class Policy:
         try:
             with nogil:
                 for k in range(count):
-                    record.write(structure, k, self.take(stamps[k], y[k], &u[k, 0]))
+                    for j in range(m):
+                        if isfinite(u[k, j]):
+                            self.held[j] = u[k, j]
+                        else:
+                            self.counters.rejected_inputs += 1
+                    record.write(structure, k, self.take(stamps[k], y[k]))
                     if carried:
                         self.carry(&present[k, 0])
                     times[k] = self.course.latest

@@ -7,7 +7,7 @@ from time import perf_counter
 from typing import Any
 
 from fhaosmo_ros.core.observer.status import UNUSED
-from fhaosmo_ros.core.online.estimator import Change, OnlineEstimator
+from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.online.events import described
 from fhaosmo_ros.core.online.snapshots import Flag
 from fhaosmo_ros.core.parameters.declaration import Parameters
@@ -88,9 +88,9 @@ class Channel:
         """Drop samples and publish nothing from now on."""
         self._active = False
 
-    def adopt(self, values: Parameters, change: Change) -> None:
-        """Go on with other live parameters, which the estimator has prepared."""
-        self.estimator.adopt(change)
+    def adopt(self, values: Parameters) -> None:
+        """Go on with other live parameters."""
+        self.estimator.configure(values)
         self._outputs.snapshot(Flag.CHANGED)
         self._use(values)
 

@@ -6,7 +6,7 @@ from contextlib import contextmanager, suppress
 from functools import partial
 from typing import Any
 
-from fhaosmo_ros.core.online.estimator import Change, OnlineEstimator
+from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.parameters.declaration import Parameters, Value
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.files import complete
@@ -245,10 +245,8 @@ class EstimatorNode(ManagedNode):
             channel.logger.info(f'{act.__name__}: {response.message}')
         return response
 
-    def _prepare(
-        self, values: Parameters, changes: Mapping[str, Value]
-    ) -> list[tuple[Parameters, Change]]:
-        """Return the parameters of each channel and its change, or raise with its name."""
+    def _prepare(self, values: Parameters, changes: Mapping[str, Value]) -> list[Parameters]:
+        """Return the parameters of each channel, or raise with its name."""
         if not self._channels:  # whether the values fit together is checked by configure
             return []
         present = self._node_parameters.values
@@ -258,17 +256,16 @@ class EstimatorNode(ManagedNode):
                     f"parameter '{name}': read when the node is configured (it is "
                     f'{present[name]!r}), got {value!r}; set it after the transition cleanup'
                 )
-        prepared = []
-        for channel in self._channels:
-            own = of_channel(values, channel.name)
+        prepared = [of_channel(values, channel.name) for channel in self._channels]
+        for channel, own in zip(self._channels, prepared, strict=True):
             with naming_channel(channel.name):
-                prepared.append((own, channel.estimator.prepare(own)))
+                channel.estimator.prepare(own)
         return prepared
 
-    def _adopt(self, prepared: list[tuple[Parameters, Change]]) -> None:
+    def _adopt(self, prepared: list[Parameters]) -> None:
         values = self._node_parameters.values
-        for channel, (own, change) in zip(self._channels, prepared, strict=True):
-            channel.adopt(own, change)
+        for channel, own in zip(self._channels, prepared, strict=True):
+            channel.adopt(own)
         if self._channels:
             set_period(self._timer, 1.0 / values['publish_rate'])
         self._publish_parameters()
