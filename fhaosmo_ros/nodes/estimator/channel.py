@@ -39,9 +39,8 @@ class Channel:
         self._clock = node.get_clock()
         self.logger = node.get_logger().get_child(name) if name else node.get_logger()
         self.estimator, observer = estimator, estimator.observer
-        self._use(values)
+        self.values = values
         self._active = False
-        self._forget()
         prefix = f'~/{name}/' if name else '~/'
         self._outputs = Outputs(node, prefix, estimator)
         self._events = create_publisher(
@@ -57,22 +56,12 @@ class Channel:
         self.simulated = node.get_parameter('use_sim_time').value
         self._health = Health(self)
 
-    def _use(self, values: Parameters) -> None:
-        self.values = values
-        self._by_clock = values['sampling'] == 'clock'
-        self._on_samples = values['publish_on'] == 'sample'
-        self._longest_wait = values['known_input_wait']
-
-    def _forget(self) -> None:
-        self._arrived = False
-        self._stale = True
-        self._silent_since: int | None = None  # by the node's clock
-        self._waits_since = 0.0
-
     def activate(self) -> None:
         """Take samples and publish from now on; the first sample starts the observer afresh."""
         self.reset()
-        self._forget()
+        self._arrived, self._stale = False, True
+        self._silent_since: int | None = None  # by the node's clock
+        self._waits_since = 0.0  # by perf_counter
         self.pairing.forget_samples()
         self._health.begin()
         self._active = True
@@ -92,7 +81,7 @@ class Channel:
         """Go on with other live parameters."""
         self.estimator.configure(values)
         self._outputs.snapshot(Flag.CHANGED)
-        self._use(values)
+        self.values = values
 
     def reports(self) -> list[Report]:
         """Return the reports for /diagnostics, on the time since the last ones."""
@@ -109,7 +98,7 @@ class Channel:
         if not self._active:
             return
         measured = stamp
-        if self._by_clock:
+        if self.values['sampling'] == 'clock':
             stamp = self._clock.now().nanoseconds
         if self.pairing.by_stamp:
             self.pairing.take_sample(measured, (stamp, y))
@@ -139,7 +128,7 @@ class Channel:
             health.d.append(estimator.policy.structure.unknown_input)
             if now >= self._outputs.due:
                 self._outputs.snapshot_of(stamp)
-            if self._on_samples:
+            if self.values['publish_on'] == 'sample':
                 self._publish()
 
     def _publish(self) -> None:
@@ -152,7 +141,8 @@ class Channel:
 
     def tick(self) -> None:
         """Publish at the node's rate, if it is to, and until y is silent by the node's clock."""
-        if self.pairing.by_stamp and perf_counter() - self._waits_since > self._longest_wait:
+        waited = perf_counter() - self._waits_since
+        if self.pairing.by_stamp and waited > self.values['known_input_wait']:
             self._take_paired(at_once=True)  # no sample follows that would release these
         if self._arrived:
             self._arrived = self._stale = False
@@ -163,7 +153,7 @@ class Channel:
                 self._silent_since = now
             elif not 0 <= now - self._silent_since <= self.estimator.silence * 1e9:
                 self._stale = True  # or the clock jumped back
-        if not self._stale and not self._on_samples:
+        if not self._stale and self.values['publish_on'] == 'timer':
             self._publish()
 
     def _tell_events(self) -> None:

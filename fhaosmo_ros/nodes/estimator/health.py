@@ -44,10 +44,8 @@ SAID = {
     'known_input_wait, or their header stamps are of another clock',
     'samples before any input': '{n} samples before any input, whose stamps are all later: are '
     'the header stamps of one clock?',
-    'divergences': 'diverged {n} times and started again from y: gains or model do not fit',
-    'jumps': 'y jumped {n} times: all estimates but that of z1 go on',
 }
-"""What is said of the counters that have grown, by `n`; `zero`: why stamps are 0."""
+"""What is said of the counters of the input that have grown, by `n`; `zero`: why stamps are 0."""
 ZERO = {
     'clock': 'nothing on /clock yet',
     'header': 'their stamps are 0: nobody fills the header; input_stamp: source does without it',
@@ -64,8 +62,6 @@ def _words(name: str) -> str:
 
 UNUSED = ('samples lost', *map(_words, UNUSED_SAMPLES), 'rejected inputs')
 """Counters of samples that the observer has not taken."""
-OTHERS = ('restarts', 'late inputs', 'samples before any input')
-"""Other counters of the input whose growth deserves a warning."""
 
 
 class Health:
@@ -152,10 +148,9 @@ class Health:
         report.find(WARN, f'{lacking} messages without y: {y.why}', lacking and not used)
         bad = sum(news[key] for key in UNUSED)
         zero = ZERO.get(stamps, 'their stamps are 0')
-        for key in (*UNUSED, *OTHERS):
+        for key, text in SAID.items():
             many = key in UNUSED and bad > BAD_SHARE * (bad + used)
-            text = SAID[key].format(n=news[key], zero=zero)
-            report.find(ERROR if many else WARN, text, news[key])
+            report.find(ERROR if many else WARN, text.format(n=news[key], zero=zero), news[key])
         spread = news['spread stamps']
         ticks = f'/clock ticks once for {used / max(1, used - spread):.0f} samples'
         report.find(WARN, ticks, used < 2 * spread)
@@ -213,8 +208,9 @@ class Health:
         # Twice: a sample that the host has stamped late closes them for a moment.
         report.find(WARN, held, before and self._closed and not stale)
         diverged, jumps = news['divergences'], news['jumps']
-        report.find(ERROR, SAID['divergences'].format(n=diverged), diverged)
-        report.find(WARN, SAID['jumps'].format(n=jumps), jumps)
+        again = f'diverged {diverged} times and started again from y: gains or model do not fit'
+        report.find(ERROR, again, diverged)
+        report.find(WARN, f'y jumped {jumps} times: all estimates but that of z1 go on', jumps)
         report.find(WARN, f'y is taken as {offset:.3g} too large since it jumped', offset)
         if observer.configuration.adaptive and not observer.self_tuning:
             away = gamma - observer.parameters['gamma_initial']

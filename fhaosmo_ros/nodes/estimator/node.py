@@ -67,7 +67,6 @@ class EstimatorNode(ManagedNode):
             'estimator', parameter_overrides=built_in(given), enable_logger_service=True, **options
         )
         self._given = given
-        self._names: list[str] = values[CHANNELS]
         self._joints: set[str] = set()  # of the message that the names come from
         self._left_out: list[str] = []  # what is said of those that are no channels
         self._channels: list[Channel] = []  # none before the names of the joints are known
@@ -88,7 +87,8 @@ class EstimatorNode(ManagedNode):
 
     def _make_estimators(self) -> dict[str, OnlineEstimator]:
         """Return new estimators; raise for parameters that do not fit together."""
-        values, names = self._node_parameters.values, self._names
+        values = self._node_parameters.values
+        names: list[str] = values[CHANNELS]
         if names == FROM_JOINTS:  # which joints there are is not known yet, but some may be named
             names = [*names, *with_own_parameters(names, values)]
         own = {name: of_channel(values, name) for name in names}
@@ -105,7 +105,7 @@ class EstimatorNode(ManagedNode):
             for topic in [*estimates_of(own[name]), EVENT]
         ]
         check_overrides(self, self._given, estimates, [wanted.topic for wanted in inputs])
-        axes = [own[name]['output_axis'] for name in self._names]
+        axes = [own[name]['output_axis'] for name in values[CHANNELS]]
         if {'wrench', 'accel'} & set(values['typed_outputs']) and len(set(axes)) < len(axes):
             raise ConfigurationError(
                 "parameter 'output_axis': expected another axis for each channel, got "
@@ -120,7 +120,7 @@ class EstimatorNode(ManagedNode):
         self.sources = Sources(self, self._found_type)
         latest = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self._parameters_topic = self.create_publisher(String, f'~/{PARAMETERS}', latest)
-        if self._names == FROM_JOINTS:
+        if values[CHANNELS] == FROM_JOINTS:
             self.sources.of(measured_output(values)).on_names = self._take_joints
             self.sources.open()
             self.get_logger().info(
@@ -167,7 +167,7 @@ class EstimatorNode(ManagedNode):
         if not isinstance(names, list) or self._joints.issuperset(names):  # at 1 kHz
             return
         present, log = self._node_parameters.values, self.get_logger()
-        if self._names != FROM_JOINTS:
+        if present[CHANNELS] != FROM_JOINTS:
             self.sources.of(measured_output(present)).on_names = None
             new = [name for name in names if name not in self._joints]
             self._left_out.append(left_out(new, 'not in the first message'))
@@ -189,7 +189,7 @@ class EstimatorNode(ManagedNode):
             **{k: v for k, v in present.items() if (split(k)[0] or fit[0]) in fit},
             CHANNELS: fit,
         }, ESTIMATOR_PARAMETERS)  # fmt: skip
-        self._names, self._joints = fit, set(names)
+        self._joints = set(names)
         self._node_parameters.extend(values)
         try:
             self._make_channels(self._make_estimators())

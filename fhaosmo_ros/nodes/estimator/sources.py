@@ -89,31 +89,18 @@ class Source:
         self._served: list[Listener] = []  # those with a field
         self._header = ''  # its name in a message
         self._subscription: Any = None
-        self._timer: Any = None
 
-    def open(self) -> None:
-        """Subscribe, now or once the type of the topic is known."""
+    def open(self) -> bool:
+        """Subscribe if the type is given, or that of the publishers is one; return whether."""
         if self.message_type:
             self._take_type(self.message_type)
-        elif self._timer is None:
-            self._timer = self._node.create_timer(
-                DISCOVERY_PERIOD, self._discover, clock=Clock(clock_type=ClockType.STEADY_TIME)
-            )
-            self._discover()
-
-    def _discover(self) -> None:
-        """Take the type of the topic's publishers, or keep why that is not possible."""
-        found = self._node.get_publishers_info_by_topic(self.topic)
-        if not found:
-            return
-        try:
-            self._take_type(min(endpoint.topic_type for endpoint in found))
-        except (LookupError, RuntimeError) as error:  # not installed here; rcl's
-            for listener in self.listeners:
-                listener.error = f'{self.topic}: {error}'
-        if self._subscription:
-            self._node.destroy_timer(self._timer)
-            self._sources.on_type()
+        elif found := self._node.get_publishers_info_by_topic(self.topic):
+            try:
+                self._take_type(min(endpoint.topic_type for endpoint in found))
+            except (LookupError, RuntimeError) as error:  # not installed here; rcl's
+                for listener in self.listeners:
+                    listener.error = f'{self.topic}: {error}'
+        return self._subscription is not None
 
     def _take_type(self, message_type: str) -> None:
         """Find the fields in a message type, and subscribe if there is one."""
@@ -190,7 +177,7 @@ class Sources:
     """
 
     def __init__(self, node: Node, on_type: Callable[[], None]) -> None:
-        self._node, self.on_type = node, on_type
+        self._node, self._on_type = node, on_type
         self._by_topic: dict[str, Source] = {}
         self.after_message: Callable[[], None] = lambda: None
 
@@ -217,10 +204,19 @@ class Sources:
         return source
 
     def open(self) -> None:
-        """Open all of them."""
-        for source in self._by_topic.values():
-            source.open()
-        self.on_type()
+        """Subscribe to all of them, to each once its type is known."""
+        self._closed = list(self._by_topic.values())
+        clock = Clock(clock_type=ClockType.STEADY_TIME)
+        self._timer = self._node.create_timer(DISCOVERY_PERIOD, self._discover, clock=clock)
+        self._discover()
+
+    def _discover(self) -> None:
+        before = len(self._closed)
+        self._closed = [source for source in self._closed if not source.open()]
+        if not self._closed:
+            self._node.destroy_timer(self._timer)
+        if len(self._closed) < before:
+            self._on_type()
 
     def look(self) -> None:
         """Look at the publishers of all topics."""
