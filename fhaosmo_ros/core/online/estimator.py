@@ -30,7 +30,8 @@ NANOSECONDS = 1e-9
 SILENCE, SILENT_SAMPLES = 0.5, 5
 """Seconds, and usual intervals, after which y is said to be silent; the larger of both."""
 LARGEST_STAMP = 2**63 - 1
-Ints = NDArray[np.int64]
+TIMES = 'nominal_period', 'max_gap', 'stuck_time', 'divergence_time', 'measurement_delay'
+"""Parameters that the policy takes as they are, in nanoseconds."""
 
 
 class OnlineEstimator:
@@ -149,28 +150,26 @@ class OnlineEstimator:
         """
         parameters, configuration = self.prepare(changes)
         with self.policy:
+            memory, counters = self.policy.memory, self.policy.counters
             if parameters['sampling'] != self._parameters['sampling']:  # stamps of another clock
-                self.policy.change(timed=False, tick_count=0)
+                memory |= {'timed': False, 'tick_count': 0}
             self.observer.adopt(configuration)
-            self.policy.configure(self.observer.structure, self._settings(parameters))
             self.events.configure(parameters)
             if self.smoothing is not None:
                 self.smoothing.configure()
             self._parameters = parameters
+            self.policy = Policy(self.observer.structure, self._settings(parameters))
+            self.policy.__setstate__((memory, counters))
 
     def _settings(self, p: Mapping[str, Any]) -> dict[str, Any]:
         """Return what the policy reads of parameters; times in nanoseconds."""
-        c = self.observer.configuration
+        c, late = self.observer.configuration, p['measurement_delay']
         knows_noise = c.self_tuning or (c.levant and c.schedule is not None)
-        times = {
-            'period': p['nominal_period'], 'max_gap': p['max_gap'],
-            'stuck_time': p['stuck_time'], 'divergence_time': p['divergence_time'],
-            'delay': p['measurement_delay'],
-            'lag': (p['measurement_delay'] - p['input_delay']) * bool(self.observer.used_inputs),
-        }  # fmt: skip
+        times = {name: p[name] for name in TIMES}
+        times['lag'] = (late - p['input_delay']) * bool(self.observer.used_inputs)
         return {name: round(seconds / NANOSECONDS) for name, seconds in times.items()} | {
             'nominal': p['sampling'] == 'nominal', 'by_clock': p['sampling'] == 'clock',
-            'to_now': p['predict_to_now'], 'gate': p['spike_gate'],
+            'to_now': p['predict_to_now'] and late > 0.0, 'gate': p['spike_gate'],
             'epsilon': math.inf if knows_noise else p['epsilon'],
         }  # fmt: skip
 
@@ -368,7 +367,7 @@ class OnlineEstimator:
             inputs = known_inputs(u, self.observer.inputs, len(y))
         return self._run(stamps.astype(np.int64, copy=False), y, inputs)
 
-    def _run(self, stamps: Ints, y: NDArray[np.float64], u: NDArray[np.float64]) -> Trajectory:
+    def _run(self, stamps: NDArray[Any], y: NDArray[Any], u: NDArray[Any]) -> Trajectory:
         """Take samples with their known inputs, and look at them for events and for smoothing."""
         with self.policy:
             record, present, times, acting = self.policy.run(stamps, y, u)

@@ -51,14 +51,14 @@ cdef int MOST_SPIKES = 5
 
 
 cdef struct Settings:
-    bint nominal  # dt is `period`, whatever the stamps say
+    bint nominal  # dt is `nominal_period`, whatever the stamps say
     bint by_clock  # stamps are the node clock's at reception
-    bint to_now  # estimates are carried over the delay
-    long long period  # nominal one
+    bint to_now  # estimates are carried over the delay, which is not 0
+    long long nominal_period
     long long max_gap  # 0: MOST_INTERVALS usual ones
     long long stuck_time  # 0: off
     long long divergence_time  # 0: off
-    long long delay  # of y
+    long long measurement_delay
     long long lag  # how much later than the inputs y is known: measurement_delay - input_delay
     double gate  # a spike is further from its prediction (unit of y); 0: off
     double epsilon  # y is lost while |eps_1| is larger (unit of y)
@@ -127,7 +127,7 @@ cdef class Policy:
 
     """
 
-    cdef readonly Structure structure  # the observer; another one after a live change
+    cdef readonly Structure structure  # the observer
     cdef SelfTuning tuner  # the same, where it is self-tuning, else None
     cdef readonly Settings settings
     cdef public Counters counters
@@ -149,19 +149,7 @@ cdef class Policy:
             'past_pieces': np.zeros((MOST_PIECES * (settings['lag'] > 0), 1 + count)),
         }
         self.held, self.present, self.pieces = self.arrays.values()
-        self.configure(structure, settings)
-
-    def configure(self, Structure structure not None, dict settings):
-        """Go on with an observer that has taken over, and with these settings."""
-        cdef Settings new = settings
-        if (
-            self.pieces.shape[0] != MOST_PIECES * (new.lag > 0)
-            or self.pieces.shape[1] != 1 + structure.inputs
-        ):
-            raise ValueError('policy: expected an observer and a past of the same known inputs')
-        if self.structure is not None:
-            self.enter()
-        self.structure, self.settings = structure, new
+        self.structure, self.settings = structure, settings
         self.tuner = structure if isinstance(structure, SelfTuning) else None
 
     def __enter__(self):
@@ -186,7 +174,7 @@ cdef class Policy:
         cdef long long now = stamp, elapsed = 0
         cdef int word
         if self.settings.nominal:
-            course.now += self.settings.period
+            course.now += self.settings.nominal_period
             now = course.now
         elif self.settings.by_clock and stamp != 0:  # 0 is no tick: the clock is not known yet
             now = clock_time(&self.clock, stamp, self.max_gap(), &self.counters.spread_stamps)
@@ -342,11 +330,11 @@ cdef class Policy:
         cdef Course* course = &self.course
         cdef long long elapsed, follow, longest = self.max_gap()
         if not course.timed:  # the stamp is of another clock: it comes as usual
-            elapsed = <long long>course.mean_interval or self.settings.period
+            elapsed = <long long>course.mean_interval or self.settings.nominal_period
             self.begin_time(now, now - elapsed)
         elapsed = difference(now, course.latest)
         if self.settings.nominal:  # nothing was lost where the period is longer
-            longest = max(longest, self.settings.period)
+            longest = max(longest, self.settings.nominal_period)
         if 0 < elapsed <= longest:
             course.held = False
             course.late_count = 0
@@ -397,7 +385,7 @@ cdef class Policy:
         if self.settings.max_gap > 0:
             return self.settings.max_gap
         if self.settings.nominal:
-            interval = self.settings.period
+            interval = self.settings.nominal_period
         return <long long>fmin(MOST_INTERVALS * interval, FAR)
 
     cdef int begin_again(self, bint forward) noexcept nogil:
@@ -571,7 +559,8 @@ cdef class Policy:
         """
         cdef double* z = self.structure.prediction.z
         cdef int i, k, n = self.structure.order, count = self.course.past_count, within = 0
-        cdef long long lag = self.settings.lag, delay = self.settings.delay, age = 0, older = lag
+        cdef long long lag = self.settings.lag, age = 0, older = lag
+        cdef long long delay = self.settings.measurement_delay
         cdef bint finite = True
         for i in range(self.structure.prediction.n):
             z[i], self.structure.prediction.dz[i] = self.structure.estimate(i), 0.0
@@ -610,8 +599,7 @@ cdef class Policy:
         cdef Structure structure = self.structure
         cdef Py_ssize_t k, j, count = y.shape[0], m = structure.inputs
         cdef Record record = Record(structure, count)
-        cdef bint carried = self.settings.to_now and self.settings.delay > 0
-        cdef double[:, ::1] present = np.empty((count * carried, structure.order + 1))
+        cdef double[:, ::1] present = np.empty((count * self.settings.to_now, structure.order + 1))
         cdef long long[::1] times = np.empty(count, dtype=np.int64)
         cdef double[:, ::1] acting = np.empty((count, m))
         self.enter()
@@ -627,7 +615,7 @@ cdef class Policy:
                         else:
                             self.counters.rejected_inputs += 1
                     record.write(structure, k, self.take(stamps[k], y[k]))
-                    if carried:
+                    if self.settings.to_now:
                         self.carry(&present[k, 0])
                     times[k] = self.course.latest
                     memcpy(&acting[k, 0], self.acting, m * sizeof(double))
@@ -638,7 +626,7 @@ cdef class Policy:
     @property
     def behind(self):
         """How long before the stamp of its sample an estimate belongs (ns)."""
-        return 0 if self.settings.to_now else self.settings.delay
+        return 0 if self.settings.to_now else self.settings.measurement_delay
 
     @property
     def stamp(self):
@@ -649,7 +637,7 @@ cdef class Policy:
         """Return the latest estimate as it is published, with the status of the last sample."""
         cdef Estimate estimate = self.structure.report()
         cdef double values[MOST_LEVELS + 1]
-        if self.settings.to_now and self.settings.delay > 0:
+        if self.settings.to_now:
             self.enter()
             self.carry(values)
             memcpy(estimate.values, values, self.structure.order * sizeof(double))
