@@ -169,8 +169,8 @@ class EventDetector:
 
         """
         times, words = stamps if times is None else times, 0 if words is None else words
-        known = 0.0 if deviations is None else deviations
-        columns = np.broadcast_arrays(stamps, times, words, d, known)
+        sizes = 0.0 if deviations is None else deviations
+        columns = np.broadcast_arrays(stamps, times, words, d, sizes)
         rows = zip(*(column.tolist() for column in columns), strict=True)
         for k, (stamp, time, word, value, deviation) in enumerate(rows):
             if word & UNUSED:

@@ -54,16 +54,16 @@ class Channel:
             self.u[u] = node.sources.add(its, take)
         self.y = node.sources.add(measured_output(values, name), self._on_sample)  # after u
         self.simulated = node.get_parameter('use_sim_time').value
-        self._health = Health(self)
+        self.health = Health(self)
 
     def activate(self) -> None:
         """Take samples and publish from now on; the first sample starts the observer afresh."""
         self.reset()
-        self._arrived, self._stale = False, True
+        self._arrived, self.stale = False, True
         self._silent_since: int | None = None  # by the node's clock
         self._waits_since = 0.0  # by perf_counter
         self.pairing.forget_samples()
-        self._health.begin()
+        self.health.begin()
         self._active = True
         if self.estimator.events.on:
             self._say(self._clock.now().nanoseconds, 'no event yet')
@@ -83,29 +83,21 @@ class Channel:
         self._outputs.snapshot(Flag.CHANGED)
         self.values = values
 
-    def reports(self) -> list[Report]:
-        """Return the reports for /diagnostics, on the time since the last ones."""
-        return self._health.reports(self._stale)
-
     def _on_input(self, index: int, stamp: int, u: float) -> None:
-        if self.pairing.by_stamp and isfinite(u):
+        if isfinite(u):
             self.pairing.take_input(index, stamp, u)
             self._take_paired()
         else:
-            self.estimator.set_input(u, index)
+            self.estimator.reject_inputs(1)
 
     def _on_sample(self, stamp: int, y: float) -> None:
         if not self._active:
             return
-        measured = stamp
-        if self.values['sampling'] == 'clock':
-            stamp = self._clock.now().nanoseconds
-        if self.pairing.by_stamp:
-            self.pairing.take_sample(measured, (stamp, y))
-            self._waits_since = perf_counter()
-            self._take_paired()
-        else:
-            self._take(stamp, y)
+        by_clock = self.values['sampling'] == 'clock'
+        time = self._clock.now().nanoseconds if by_clock else stamp
+        self.pairing.take_sample(stamp, (time, y))
+        self._waits_since = perf_counter()
+        self._take_paired()
 
     def _take_paired(self, at_once: bool = False) -> None:
         """Step to the samples whose known inputs are there."""
@@ -116,7 +108,7 @@ class Channel:
 
     def _take(self, stamp: int, y: float) -> None:
         """Step the observer to a sample."""
-        estimator, health, begin = self.estimator, self._health, perf_counter()
+        estimator, health, begin = self.estimator, self.health, perf_counter()
         word = estimator.advance(stamp, y)
         now = perf_counter()
         if estimator.events.waiting:
@@ -127,7 +119,7 @@ class Channel:
             health.stepping += now - begin
             health.d.append(estimator.policy.structure.unknown_input)
             if now >= self._outputs.due:
-                self._outputs.snapshot_of(stamp)
+                self._outputs.snapshot(Flag(0) if self._outputs.due else Flag.STARTED)
             if self.values['publish_on'] == 'sample':
                 self._publish()
 
@@ -141,19 +133,18 @@ class Channel:
 
     def tick(self) -> None:
         """Publish at the node's rate, if it is to, and until y is silent by the node's clock."""
-        waited = perf_counter() - self._waits_since
-        if self.pairing.by_stamp and waited > self.values['known_input_wait']:
+        if perf_counter() - self._waits_since > self.values['known_input_wait']:
             self._take_paired(at_once=True)  # no sample follows that would release these
         if self._arrived:
-            self._arrived = self._stale = False
+            self._arrived = self.stale = False
             self._silent_since = None
-        elif not self._stale:
+        elif not self.stale:
             now = self._clock.now().nanoseconds
             if self._silent_since is None:  # the clock is not read while samples come
                 self._silent_since = now
             elif not 0 <= now - self._silent_since <= self.estimator.silence * 1e9:
-                self._stale = True  # or the clock jumped back
-        if not self._stale and self.values['publish_on'] == 'timer':
+                self.stale = True  # or the clock jumped back
+        if not self.stale and self.values['publish_on'] == 'timer':
             self._publish()
 
     def _tell_events(self) -> None:

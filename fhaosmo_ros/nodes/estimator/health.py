@@ -98,14 +98,14 @@ class Health:
             'events': channel.estimator.events.count,
         }
 
-    def reports(self, stale: bool) -> list[Report]:
+    def reports(self) -> list[Report]:
         """Return the reports on the time since the last ones."""
         before, self._before = self._before, self._counts()
         news = {key: count - before[key] for key, count in self._before.items()}
         periods = np.diff(np.array(self.stamps)) * NANOSECONDS
         period = float(np.mean(periods)) if len(periods) else nan
         jitter = float(np.std(periods)) / period if period > 0.0 else nan
-        reports = [self._input(news, stale, period, jitter), self._observer(news, stale, period)]
+        reports = [self._input(news, period, jitter), self._observer(news, period)]
         del self.stamps[:], self.d[:]
         self.stepping = 0.0
         return reports
@@ -113,7 +113,7 @@ class Health:
     def _report(self, task: str, values: Mapping[str, Any]) -> Report:
         return Report(f'{self._channel.name} {task}'.lstrip(), values)
 
-    def _input(self, news: Mapping[str, int], stale: bool, period: float, jitter: float) -> Report:
+    def _input(self, news: Mapping[str, int], period: float, jitter: float) -> Report:
         """Report on the samples; `news` is by how much each counter has grown."""
         channel, y, limits = self._channel, self._channel.y, self._channel.values
         source, heard = y.source, y.source.heard
@@ -139,7 +139,7 @@ class Health:
             report.find(WARN if heard else ERROR, text)
         silence = ERROR if y.error or (source.unheard and not heard) else STALE
         since = f'for {age:.3g} s' if age == age else 'yet'
-        report.find(silence, f'no usable sample {since}', stale)
+        report.find(silence, f'no usable sample {since}', channel.stale)
         alone = f'no publisher of {source.topic} that can be heard'
         report.find(silence, alone, not heard and not y.error)
         used, lacking = news['samples accepted'], news['messages without y']
@@ -171,9 +171,10 @@ class Health:
             report.find(WARN, f'no publisher of {name}', nobody)
         return report
 
-    def _observer(self, news: Mapping[str, int], stale: bool, period: float) -> Report:
+    def _observer(self, news: Mapping[str, int], period: float) -> Report:
         """Report on the estimates and the steps."""
-        estimator, limits = self._channel.estimator, self._channel.values
+        channel, limits = self._channel, self._channel.values
+        estimator = channel.estimator
         observer, estimate, offset = estimator.observer, estimator.estimate, estimator.offset
         unit = derivative_unit(limits['measurement_unit'], observer.order)
         gamma, d = (estimate.gamma, estimate.unknown_input) if estimate else (nan, nan)
@@ -202,11 +203,11 @@ class Health:
         if limits['unknown_input_unit']:
             scaled = titled('unknown input, scaled', limits['unknown_input_unit'])
             report.values[scaled] = d * limits['unknown_input_scale']
-        report.find(STALE, 'no usable samples', stale)
+        report.find(STALE, 'no usable samples', channel.stale)
         held = f'levels from {levels + 1} on hold: an innovation is above epsilon'
         before, self._closed = self._closed, estimate is not None and levels < observer.levels
         # Twice: a sample that the host has stamped late closes them for a moment.
-        report.find(WARN, held, before and self._closed and not stale)
+        report.find(WARN, held, before and self._closed and not channel.stale)
         diverged, jumps = news['divergences'], news['jumps']
         again = f'diverged {diverged} times and started again from y: gains or model do not fit'
         report.find(ERROR, again, diverged)

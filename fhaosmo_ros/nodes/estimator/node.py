@@ -285,7 +285,8 @@ class EstimatorNode(ManagedNode):
         reports = [state]
         if active and not waits:
             self.sources.look()
-            reports += [report for channel in self._channels for report in channel.reports()]
+            for channel in self._channels:
+                reports += channel.health.reports()
         if active:  # that y is silent is said of the input
             silent = (STALE, 'no usable samples')
             self._log.tell(r for r in reports if (r.level, r.text) != silent)

@@ -67,12 +67,6 @@ class Outputs:
         for name, publisher in self._listeners.heard().items():
             publisher.publish(self._make[name](estimate, stamp))
 
-    def snapshot_of(self, stamp: int) -> None:
-        """Publish the snapshot that is due, with this sample."""
-        # Where samples wait in a queue, the observer may be ahead of this one.
-        begins = not self.due and stamp == self._estimator.latest
-        self.snapshot(Flag.STARTED if begins else Flag(0))
-
     def snapshot(self, flags: Flag) -> None:
         """
         Publish what the estimator remembers, and what has happened at the latest sample.
