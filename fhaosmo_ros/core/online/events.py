@@ -168,10 +168,13 @@ class EventDetector:
             Status words of the samples.
 
         """
-        times, words = stamps if times is None else times, 0 if words is None else words
-        sizes = 0.0 if deviations is None else deviations
-        columns = np.broadcast_arrays(stamps, times, words, d, sizes)
-        rows = zip(*(column.tolist() for column in columns), strict=True)
+        zeros = np.zeros(np.size(d))
+        columns = [
+            stamps, stamps if times is None else times,
+            zeros.astype(int) if words is None else words, d,
+            zeros if deviations is None else deviations,
+        ]  # fmt: skip
+        rows = zip(*(np.asarray(column).tolist() for column in columns), strict=True)
         for k, (stamp, time, word, value, deviation) in enumerate(rows):
             if word & UNUSED:
                 continue

@@ -198,7 +198,7 @@ cdef class Policy:
                 word = word & (FLAGS_MASK ^ REJECTED_STEP) | DIVERGED | self.structure.measure(y)
         if not word & UNUSED:
             course.valid = True
-            self.present[:] = self.held
+            memcpy(&self.present[0], &self.held[0], self.structure.inputs * sizeof(double))
             course.stamp = stamp if self.settings.nominal else now
         elif not word & REJECTED_STEP:  # the estimate stays that of the latest sample
             if word & JUMPED:  # z_1 has followed y, and only the next sample gives it a time

@@ -133,7 +133,7 @@ class EstimatorNode(ManagedNode):
 
     def _publish_parameters(self) -> None:
         if self._parameters_topic is not None:
-            text = parameter_text(self, self._node_parameters.values)
+            text = parameter_text(self, self._node_parameters.values, self._channels)
             self._parameters_topic.publish(String(data=text))
 
     def _make_channels(self, estimators: Mapping[str, OnlineEstimator]) -> None:

@@ -1,20 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """What channels publish, alone and together, and the text with the parameters of their node."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from math import nan
 from time import perf_counter
 from typing import Any
 
 from builtin_interfaces.msg import Time
-from fhaosmo_ros.core.model.triangular import TriangularModel
 from fhaosmo_ros.core.observer.estimates import Estimate, TUNING
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.online.snapshots import Flag, pack, Snapshot
 from fhaosmo_ros.core.parameters.declaration import Parameters
 from fhaosmo_ros.core.parameters.files import dumps
-from fhaosmo_ros.core.parameters.per_channel import CHANNELS, differing, of_channel
-from fhaosmo_ros.inputs import Input, known_inputs, measured_output
+from fhaosmo_ros.core.parameters.per_channel import differing
+from fhaosmo_ros.nodes.estimator.sources import Listener
 from fhaosmo_ros.nodes.middleware.endpoints import create_publisher, DEPTH, LATCHED, Listeners
 from fhaosmo_ros.nodes.middleware.messages import labelled, message_class, time_message
 from fhaosmo_ros.topics import ARRAY, estimates_of, SNAPSHOT, STANDARD_DEVIATION, TYPED_ESTIMATES
@@ -135,27 +134,24 @@ def _fill(message: Any, name: str, outputs: Mapping[str, Output]) -> None:
             setattr(getattr(message.accel, vector), axis, d)
 
 
-def parameter_text(node: Node, values: Parameters) -> str:
+def parameter_text(node: Node, values: Parameters, channels: Iterable[Any]) -> str:
     """
     Return the parameters of a node as the text of a file that makes such a node.
 
     It has the topics of y and u that a remapping has changed: a bag knows of none.
     """
-    resolved = node.resolve_topic_name
 
-    def is_remapped(wanted: Input) -> bool:
-        return bool(resolved(wanted.topic) != wanted.absolute(node.get_namespace()))
+    def is_remapped(listener: Listener) -> bool:
+        return listener.source.topic != listener.wanted.absolute(node.get_namespace())
 
     named = differing(values)
-    for channel in values[CHANNELS]:
-        prefix = f'{channel}.' if channel else ''
-        own = of_channel(values, channel)
-        y = measured_output(own, channel)
+    for channel in channels:
+        prefix = f'{channel.name}.' if channel.name else ''
+        y, u = channel.y, channel.u.values()
         if is_remapped(y):
-            named[f'{prefix}input_topic'] = resolved(y.topic)
-            named[f'{prefix}input_type'] = y.message_type
-        u = known_inputs(own, TriangularModel.of(own).used_inputs, channel).values()
+            named[f'{prefix}input_topic'] = y.source.topic
+            named[f'{prefix}input_type'] = y.wanted.message_type
         if any(map(is_remapped, u)):
-            named[f'{prefix}known_input_topics'] = [resolved(one.topic) for one in u]
-            named[f'{prefix}known_input_types'] = [one.message_type for one in u]
+            named[f'{prefix}known_input_topics'] = [one.source.topic for one in u]
+            named[f'{prefix}known_input_types'] = [one.wanted.message_type for one in u]
     return dumps(named, node.get_fully_qualified_name())

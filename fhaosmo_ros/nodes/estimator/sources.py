@@ -42,7 +42,7 @@ class Listener:
     """
 
     def __init__(self, wanted: Input, take: Take, source: 'Source') -> None:
-        self._wanted, self.take, self.source = wanted, take, source
+        self.wanted, self.take, self.source = wanted, take, source
         self.field: Field | None = None
         self.value: Callable[[Any], float]
         self.stamps = self.error = ''
@@ -53,11 +53,11 @@ class Listener:
         """Find its field in a message type, or keep the reason as `error`."""
         self.error, self.field = '', None
         try:
-            field = find_wanted(types, self._wanted._replace(message_type=message_type))
+            field = find_wanted(types, self.wanted._replace(message_type=message_type))
         except ConfigurationError as error:
             self.error = str(error)
             return
-        self.field, self.stamps, self.value = field, self._wanted.stamp, field.reader()
+        self.field, self.stamps, self.value = field, self.wanted.stamp, field.reader()
         if self.stamps == 'auto':
             self.stamps = 'header' if field.header else 'source'
         if field.wraps:
