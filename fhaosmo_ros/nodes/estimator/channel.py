@@ -27,32 +27,32 @@ class Channel:
     """
     Takes y and the known inputs out of messages, steps the observer, publishes the estimates.
 
-    A new channel is inactive: its topics and services exist, but samples are dropped and nothing
-    is published. `name` is in its topics, services, reports and log, '' without names. The `node`
-    has the `sources` and the `typed` outputs that its channels share.
+    A new channel has no topics. An open one has, but before it is activated samples are dropped
+    and nothing is published. `name` is in its topics, services, reports and log, '' without names;
+    topics begin with `prefix`. The `node` has the `sources` and the `typed` outputs that its
+    channels share. `measured` and `known` say what y and the known inputs are.
     """
 
-    def __init__(
-        self, node: Any, values: Parameters, estimator: OnlineEstimator, name: str = ''
-    ) -> None:
-        self._node, self.name = node, name
-        self._clock = node.get_clock()
+    def __init__(self, node: Any, values: Parameters, name: str = '') -> None:
+        self._node, self.values, self.name = node, values, name
         self.logger = node.get_logger().get_child(name) if name else node.get_logger()
-        self.estimator, observer = estimator, estimator.observer
-        self.values = values
-        self._active = False
-        prefix = f'~/{name}/' if name else '~/'
-        self._outputs = Outputs(node, prefix, estimator)
-        self._events = create_publisher(
-            node, message_class(DIAGNOSTICS), prefix + EVENT, latched=True
-        )
-        known = known_inputs(values, observer.used_inputs, name)
-        self.pairing = Pairing(values, observer.inputs, known, estimator.inputs)
+        self.prefix = f'~/{name}/' if name else '~/'
+        self.estimator = OnlineEstimator(values)
+        self.measured = measured_output(values, name)
+        self.known = known_inputs(values, self.estimator.observer.used_inputs, name)
+        self._clock, self._active = node.get_clock(), False
+
+    def open(self) -> None:
+        """Make its topics, and listen to y and to the known inputs."""
+        node, estimator, inputs = self._node, self.estimator, self.estimator.observer.inputs
+        self._outputs = Outputs(node, self.prefix, estimator)
+        kind = message_class(DIAGNOSTICS)
+        self._events = create_publisher(node, kind, self.prefix + EVENT, latched=True)
+        self.pairing = Pairing(self.values, inputs, self.known, estimator.inputs)
         self.u: dict[str, Listener] = {}
-        for u, its in known.items():
-            take = partial(self._on_input, observer.inputs.index(u))
-            self.u[u] = node.sources.add(its, take)
-        self.y = node.sources.add(measured_output(values, name), self._on_sample)  # after u
+        for u, its in self.known.items():
+            self.u[u] = node.sources.add(its, partial(self._on_input, inputs.index(u)))
+        self.y = node.sources.add(self.measured, self._on_sample)  # after u
         self.simulated = node.get_parameter('use_sim_time').value
         self.health = Health(self)
 

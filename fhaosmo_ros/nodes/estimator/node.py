@@ -6,7 +6,6 @@ from contextlib import contextmanager, suppress
 from functools import partial
 from typing import Any
 
-from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.parameters.declaration import Parameters, Value
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.files import complete
@@ -19,7 +18,7 @@ from fhaosmo_ros.core.parameters.per_channel import (
     with_own_parameters,
 )
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
-from fhaosmo_ros.inputs import known_inputs, measured_output, with_joints
+from fhaosmo_ros.inputs import measured_output, with_joints
 from fhaosmo_ros.messages.fields import listed
 from fhaosmo_ros.nodes.estimator.channel import Channel
 from fhaosmo_ros.nodes.estimator.outputs import parameter_text, TypedOutputs
@@ -79,44 +78,39 @@ class EstimatorNode(ManagedNode):
             if values['autostart']:
                 self.start()
             else:
-                self._make_estimators()  # bad parameters end the node in any case
+                self._new_channels()  # bad parameters end the node in any case
                 self.get_logger().info('waiting to be configured, as by ros2 lifecycle set')
         except Exception:
             self.destroy_node()
             raise
 
-    def _make_estimators(self) -> dict[str, OnlineEstimator]:
-        """Return new estimators; raise for parameters that do not fit together."""
+    def _new_channels(self) -> list[Channel]:
+        """Return new channels; raise for parameters that do not fit together."""
         values = self._node_parameters.values
         names: list[str] = values[CHANNELS]
         if names == FROM_JOINTS:  # which joints there are is not known yet, but some may be named
             names = [*names, *with_own_parameters(names, values)]
-        own = {name: of_channel(values, name) for name in names}
-        estimators, inputs = {}, []
-        for name, mine in own.items():
+        channels, inputs, estimates = [], [], []
+        for name in names:
             with naming_channel(name):
-                estimators[name] = OnlineEstimator(mine)
-            known = known_inputs(mine, estimators[name].observer.used_inputs, name)
-            inputs += [measured_output(mine, name), *known.values()]
+                channels.append(channel := Channel(self, of_channel(values, name), name))
+            inputs += [channel.measured, *channel.known.values()]
+            topics = [*estimates_of(channel.values), EVENT]
+            estimates += [channel.prefix + topic for topic in topics]
         check_inputs(self, inputs)
-        estimates = [
-            f'~/{name}/{topic}' if name else f'~/{topic}'
-            for name in names
-            for topic in [*estimates_of(own[name]), EVENT]
-        ]
         check_overrides(self, self._given, estimates, [wanted.topic for wanted in inputs])
-        axes = [own[name]['output_axis'] for name in values[CHANNELS]]
+        axes = [channel.values['output_axis'] for channel in channels[: len(values[CHANNELS])]]
         if {'wrench', 'accel'} & set(values['typed_outputs']) and len(set(axes)) < len(axes):
             raise ConfigurationError(
                 "parameter 'output_axis': expected another axis for each channel, got "
                 f'{", ".join(axes)}'
             )
-        return estimators
+        return channels
 
     def configure(self) -> None:
         """Make the channel, or channels, from the present parameters."""
         values = self._node_parameters.values
-        estimators = self._make_estimators()
+        channels = self._new_channels()
         self.sources = Sources(self, self._found_type)
         latest = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self._parameters_topic = self.create_publisher(String, f'~/{PARAMETERS}', latest)
@@ -128,7 +122,7 @@ class EstimatorNode(ManagedNode):
                 f'{self.resolve_topic_name(measured_output(values).topic)}'
             )
         else:
-            self._make_channels(estimators)
+            self._open(channels)
         self._publish_parameters()
 
     def _publish_parameters(self) -> None:
@@ -136,22 +130,21 @@ class EstimatorNode(ManagedNode):
             text = parameter_text(self, self._node_parameters.values, self._channels)
             self._parameters_topic.publish(String(data=text))
 
-    def _make_channels(self, estimators: Mapping[str, OnlineEstimator]) -> None:
-        """Make a channel for each estimator, by its name, and what they share."""
+    def _open(self, channels: list[Channel]) -> None:
+        """Open channels, and what they share."""
         values = self._node_parameters.values
         self._timer = self.create_timer(1.0 / values['publish_rate'], self._tick)
         self._timer.cancel()
         self.typed = TypedOutputs(self, values)
-        self._channels = [
-            Channel(self, of_channel(values, name), estimator, name)
-            for name, estimator in estimators.items()
-        ]
+        for channel in channels:
+            channel.open()
         self.sources.after_message = self.typed.publish
-        of_prefix = {f'~/{channel.name}/': [channel] for channel in self._channels if channel.name}
-        for prefix, channels in {**of_prefix, '~/': self._channels}.items():
+        by_prefix = {channel.prefix: [channel] for channel in channels}
+        for prefix, those in {**by_prefix, '~/': channels}.items():
             for kind, act in ((Trigger, Channel.reset), (SetBool, Channel.freeze)):
-                answer = partial(self._answer, channels, act)
+                answer = partial(self._answer, those, act)
                 self.create_service(kind, prefix + act.__name__, answer)
+        self._channels = channels
         self.sources.open()
 
     def _found_type(self) -> None:
@@ -192,7 +185,7 @@ class EstimatorNode(ManagedNode):
         self._joints = set(names)
         self._node_parameters.extend(values)
         try:
-            self._make_channels(self._make_estimators())
+            self._open(self._new_channels())
         except ConfigurationError as error:
             log.error(str(error))
             return
