@@ -39,16 +39,13 @@ class Counters(NamedTuple):
     @property
     def rejected(self) -> int:
         """Samples of y that were not used."""
-        return sum(getattr(self, name) for name in UNUSED_SAMPLES)
+        return (
+            self.rejected_measurements + self.rejected_spikes + self.rejected_stuck
+            + self.rejected_steps + self.duplicate_stamps + self.backward_stamps
+            + self.zero_stamps + self.far_stamps
+        )  # fmt: skip
 
     @property
     def restarts(self) -> int:
         """Starts from a new sample after a gap or a jump of time."""
         return self.restarts_forward + self.restarts_backward
-
-
-UNUSED_SAMPLES = (
-    'rejected_measurements', 'rejected_spikes', 'rejected_stuck', 'rejected_steps',
-    'duplicate_stamps', 'backward_stamps', 'zero_stamps', 'far_stamps',
-)  # fmt: skip
-"""Counters that together are `Counters.rejected`."""

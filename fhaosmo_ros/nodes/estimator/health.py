@@ -7,7 +7,6 @@ from math import inf, nan
 from time import perf_counter
 from typing import Any
 
-from fhaosmo_ros.core.online.counters import UNUSED_SAMPLES
 from fhaosmo_ros.core.parameters.units import derivative_unit, titled
 from fhaosmo_ros.core.simulation.metrics import high_passed
 from fhaosmo_ros.nodes.middleware.diagnostics import ERROR, Report, STALE, WARN
@@ -24,7 +23,7 @@ RATE_RATIO = 1.5
 """Factor between the rate of y and that of the gains that deserves one."""
 SPREAD = 3.0
 """Factor between the innovations and those expected that deserves one."""
-SAID = {
+UNUSED = {
     'samples lost': '{n} samples lost: they did not arrive, or were damaged',
     'rejected measurements': '{n} samples rejected: y was NaN, infinite or beyond 1e60',
     'rejected spikes': '{n} samples rejected: y was further than spike_gate, or 6 usual '
@@ -38,6 +37,9 @@ SAID = {
     'far stamps': '{n} samples held back: stamps more than max_gap from the one before; the next '
     'sample decides',
     'rejected inputs': '{n} known inputs rejected: expected finite numbers; the last one is held',
+}
+"""What is said of the samples that were not used, by counter; `zero`: why stamps are 0."""
+UNUSUAL = {
     'restarts': '{n} restarts: stamps jumped by more than max_gap; where y always comes so '
     'slowly, set max_gap to several of its periods',
     'late inputs': '{n} late inputs, which came after their sample had been used: raise '
@@ -45,7 +47,7 @@ SAID = {
     'samples before any input': '{n} samples before any input, whose stamps are all later: are '
     'the header stamps of one clock?',
 }
-"""What is said of the counters of the input that have grown, by `n`; `zero`: why stamps are 0."""
+"""What is said of other counters of the input that have grown by `n`."""
 ZERO = {
     'clock': 'nothing on /clock yet',
     'header': 'their stamps are 0: nobody fills the header; input_stamp: source does without it',
@@ -54,14 +56,6 @@ HOST_TIME = (
     "use_sim_time with sampling = source_stamp: the middleware's stamps know nothing of /clock, "
     "so dt is in the host's time; set sampling to clock for simulation time"
 )
-
-
-def _words(name: str) -> str:
-    return name.replace('_', ' ')
-
-
-UNUSED = ('samples lost', *map(_words, UNUSED_SAMPLES), 'rejected inputs')
-"""Counters of samples that the observer has not taken."""
 
 
 class Health:
@@ -86,12 +80,13 @@ class Health:
     def _counts(self) -> dict[str, int]:
         channel, y = self._channel, self._channel.y
         counters = channel.estimator.counters
+        own = {name.replace('_', ' '): count for name, count in counters._asdict().items()}
         return {
-            'samples accepted': counters.accepted,
+            'samples accepted': own.pop('accepted'),
             'samples lost': y.source.numbers.lost,
             'messages without y': y.lacking,
             'samples rejected': counters.rejected,
-            **{_words(name): n for name, n in counters._asdict().items() if name != 'accepted'},
+            **own,
             'restarts': counters.restarts,
             'late inputs': channel.pairing.late,
             'samples before any input': channel.pairing.ahead,
@@ -148,7 +143,7 @@ class Health:
         report.find(WARN, f'{lacking} messages without y: {y.why}', lacking and not used)
         bad = sum(news[key] for key in UNUSED)
         zero = ZERO.get(stamps, 'their stamps are 0')
-        for key, text in SAID.items():
+        for key, text in (UNUSED | UNUSUAL).items():
             many = key in UNUSED and bad > BAD_SHARE * (bad + used)
             report.find(ERROR if many else WARN, text.format(n=news[key], zero=zero), news[key])
         spread = news['spread stamps']

@@ -238,10 +238,10 @@ class EstimatorNode(ManagedNode):
             channel.logger.info(f'{act.__name__}: {response.message}')
         return response
 
-    def _prepare(self, values: Parameters, changes: Mapping[str, Value]) -> list[Parameters]:
-        """Return the parameters of each channel, or raise with its name."""
+    def _prepare(self, values: Parameters, changes: Mapping[str, Value]) -> None:
+        """Raise for changes that can not be, with the name of the channel."""
         if not self._channels:  # whether the values fit together is checked by configure
-            return []
+            return
         present = self._node_parameters.values
         for name, value in changes.items():
             if not values.table[name].live and value != present[name]:
@@ -249,16 +249,14 @@ class EstimatorNode(ManagedNode):
                     f"parameter '{name}': read when the node is configured (it is "
                     f'{present[name]!r}), got {value!r}; set it after the transition cleanup'
                 )
-        prepared = [of_channel(values, channel.name) for channel in self._channels]
-        for channel, own in zip(self._channels, prepared, strict=True):
+        for channel in self._channels:
             with naming_channel(channel.name):
-                channel.estimator.prepare(own)
-        return prepared
+                channel.estimator.prepare(of_channel(values, channel.name))
 
-    def _adopt(self, prepared: list[Parameters]) -> None:
+    def _adopt(self, _: None) -> None:
         values = self._node_parameters.values
-        for channel, own in zip(self._channels, prepared, strict=True):
-            channel.adopt(own)
+        for channel in self._channels:
+            channel.adopt(of_channel(values, channel.name))
         if self._channels:
             set_period(self._timer, 1.0 / values['publish_rate'])
         self._publish_parameters()
