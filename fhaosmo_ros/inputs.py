@@ -125,6 +125,8 @@ class Pairing:
 
     Attributes
     ----------
+    by_stamp : bool
+        An input is by its header's stamp; else none has to be paired.
     late, ahead : int
         Inputs that came after their sample had been released; samples that were released when
         all of an input's stamps were later than theirs, or the next one by more than max_gap.
@@ -142,6 +144,7 @@ class Pairing:
         self._max_gap = round((values['max_gap'] or BACK) * 1e9)
         self._held = list(held)
         paired = [names.index(name) for name, its in known.items() if its.stamp == 'header']
+        self.by_stamp = bool(paired)
         self._coming: dict[int, deque[tuple[int, float]]] = {j: deque(maxlen=MOST) for j in paired}
         self._newest = dict.fromkeys(paired, 0)
         self._known: set[int] = set()

@@ -84,20 +84,23 @@ class Channel:
         self.values = values
 
     def _on_input(self, index: int, stamp: int, u: float) -> None:
-        if isfinite(u):
+        if self.pairing.by_stamp and isfinite(u):
             self.pairing.take_input(index, stamp, u)
             self._take_paired()
         else:
-            self.estimator.reject_inputs(1)
+            self.estimator.set_input(u, index)
 
     def _on_sample(self, stamp: int, y: float) -> None:
         if not self._active:
             return
         by_clock = self.values['sampling'] == 'clock'
         time = self._clock.now().nanoseconds if by_clock else stamp
-        self.pairing.take_sample(stamp, (time, y))
-        self._waits_since = perf_counter()
-        self._take_paired()
+        if self.pairing.by_stamp:
+            self.pairing.take_sample(stamp, (time, y))
+            self._waits_since = perf_counter()
+            self._take_paired()
+        else:  # in half the time
+            self._take(time, y)
 
     def _take_paired(self, at_once: bool = False) -> None:
         """Step to the samples whose known inputs are there."""
@@ -133,7 +136,8 @@ class Channel:
 
     def tick(self) -> None:
         """Publish at the node's rate, if it is to, and until y is silent by the node's clock."""
-        if perf_counter() - self._waits_since > self.values['known_input_wait']:
+        waited = perf_counter() - self._waits_since
+        if self.pairing.by_stamp and waited > self.values['known_input_wait']:
             self._take_paired(at_once=True)  # no sample follows that would release these
         if self._arrived:
             self._arrived = self.stale = False
