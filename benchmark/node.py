@@ -21,7 +21,7 @@ from time import monotonic, sleep, time_ns
 from typing import NamedTuple
 
 from builtin_interfaces.msg import Time
-from fhaosmo_ros.nodes.middleware.diagnostics import DiagnosticsPublisher, Report
+from fhaosmo_ros.nodes.middleware.diagnostics import publish_diagnostics, Report
 from fhaosmo_ros.nodes.middleware.endpoints import SENSOR_QOS, subscribe_with_info
 from fhaosmo_ros.nodes.middleware.spin import Spinner
 from live import Child, start_node, wait_until, Watch
@@ -202,9 +202,8 @@ class EmptyNode(Node):
             (self.create_publisher(kind, t, 10).publish, self._stamp if kind is Time else kind())
             for t, kind in topics(EMPTY, joints).items()
         ]
-        self._diagnostics = DiagnosticsPublisher(
-            self, self._reports, {'diagnostics_period': 1.0, 'hardware_id': 'none'}
-        )
+        self.values = {'diagnostics_period': 1.0, 'hardware_id': 'none'}
+        publish_diagnostics(self, self._reports)
         self._each = not rate
         if rate:
             self._timer = self.create_timer(1.0 / rate, self._publish)
@@ -239,10 +238,8 @@ def main(what: str, rate: str, joints: str) -> None:
     if what == 'source':
         publish_samples(float(rate), int(joints), ended)
     else:
-        node = EmptyNode(float(rate), int(joints))
-        with Spinner(node, on_end=ended.set):
+        with Spinner(EmptyNode(float(rate), int(joints)), on_end=ended.set):
             ended.wait()
-        node.destroy_node()
     rclpy.try_shutdown()
 
 

@@ -16,6 +16,7 @@ from fhaosmo_ros.core.parameters.tables import CHANNEL_PARAMETERS
 from fhaosmo_ros.messages.fields import JOINT_STATE
 from fhaosmo_ros.topics import FLOAT
 
+PARTS = ('topic', 'type', 'field', 'stamp')
 BACK = 0.5
 """Seconds by which stamps of a known input go back if its clock does, where max_gap is 0."""
 MOST = 1000
@@ -60,12 +61,10 @@ def measured_output(values: Mapping[str, Any], channel: str = '') -> Input:
         Its name, '' without named channels.
 
     """
-    topic, kind, field, stamp = (
-        values[f'input_{part}'] for part in ('topic', 'type', 'field', 'stamp')
-    )
+    *parts, stamp = (values[f'input_{part}'] for part in PARTS)
     if stamp == 'auto' and 'header' in values['known_input_stamps']:
         stamp = 'header'
-    return _input('y', topic, kind, field, stamp, channel)
+    return _input('y', *parts, stamp, channel)
 
 
 def known_inputs(
@@ -92,10 +91,8 @@ def known_inputs(
     given = values[stamps.name]
     if 'header' in given and by not in ('auto', 'header'):
         raise stamps.error(given, f'reception where input_stamp is {by}')
-    columns = [
-        _one_each(CHANNEL_PARAMETERS[f'known_input_{part}'], values, names)
-        for part in ('topics', 'types', 'fields', 'stamps')
-    ]
+    lists = (CHANNEL_PARAMETERS[f'known_input_{part}s'] for part in PARTS)
+    columns = [_one_each(declared, values, names) for declared in lists]
     return {
         name: _input(name, *parts, channel) for name, *parts in zip(names, *columns, strict=True)
     }

@@ -1,15 +1,31 @@
 # SPDX-License-Identifier: Apache-2.0
 """The package's commands as processes of their own, as users start them."""
 
+import contextlib
+import fcntl
 import os
 from pathlib import Path
-import signal
 import subprocess
 import sys
+import tempfile
 import time
 
+# Of ROS: ids up to 101 keep clear of Linux' ephemeral ports; those below 20 are the benchmarks'.
+DOMAINS = range(20, 102)
+_locks = []
 ROOT = Path(__file__).resolve().parents[1]
 COMMAND = [sys.executable, '-m', 'fhaosmo_ros']
+
+
+def take_domain() -> int:
+    """Return a domain that no other test process of this machine has; held until the end."""
+    for number in DOMAINS:
+        path = Path(tempfile.gettempdir()) / f'fhaosmo_ros_test_domain_{number}.lock'
+        _locks.append(path.open('w'))
+        with contextlib.suppress(OSError):  # taken
+            fcntl.flock(_locks[-1], fcntl.LOCK_EX | fcntl.LOCK_NB)
+            return number
+    raise RuntimeError(f'all ROS domains {DOMAINS} are taken by test processes')
 
 
 def environment(**changes):
@@ -26,20 +42,12 @@ def start(*arguments, command=COMMAND, **options):
     )  # fmt: skip
 
 
-def run(*arguments):
-    """Run a command to its end."""
+def run(*arguments, command=COMMAND, **options):
+    """Run a command, or another program, to its end."""
     return subprocess.run(
-        [*COMMAND, *map(str, arguments)], capture_output=True, text=True, timeout=400,
-        env=environment(), check=False,
+        [*command, *map(str, arguments)], capture_output=True, text=True, check=False,
+        **{'env': environment(), 'timeout': 400} | options,
     )  # fmt: skip
-
-
-def interrupted(process):
-    """Press Ctrl-C, and return what the command, which has to end well, has said."""
-    process.send_signal(signal.SIGINT)
-    out, error = process.communicate(timeout=60)
-    assert process.returncode == 0, (out, error)
-    return out, error
 
 
 def wait_until(condition, what, seconds=60.0, process=None):

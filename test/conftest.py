@@ -7,7 +7,7 @@ import os
 from pathlib import Path
 import signal
 
-from domains import take_domain
+from commands import take_domain
 from hypothesis import settings
 import pytest
 

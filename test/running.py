@@ -9,8 +9,8 @@ import threading
 import time
 
 from builtin_interfaces.msg import Time
+from commands import ROOT
 from diagnostic_msgs.msg import DiagnosticArray
-import fhaosmo_ros
 from fhaosmo_ros.nodes.middleware.endpoints import subscribe_with_info
 from fhaosmo_ros.nodes.recording import PrivateNode
 from fhaosmo_ros.tools.cli.processes import Child
@@ -23,7 +23,6 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64, Float64MultiArray, Header, String
 from std_srvs.srv import Trigger
 
-ROOT = Path(fhaosmo_ros.__file__).parents[1]
 DEADLINE = 60.0
 """Seconds for what takes one on a quiet machine."""
 FIRST_TRY = 0.25
@@ -106,11 +105,17 @@ class Process(Child):
             assert self.poll() is None, f'it has ended by itself:\n{self.output()}'
             super().interrupt()
 
-    def check_end(self) -> None:
-        """Wait for the end after `interrupt`: a good one, with nothing terrible said."""
+    def check_end(self) -> str:
+        """Wait for the end after `interrupt`, a good one with nothing terrible in its output."""
         assert self._may_end or self.wait() == 0, self.output()
         for word in ('Traceback', 'Exception', 'terminate called'):
             assert word not in self.output(), self.output()
+        return self.output()
+
+    def stop(self) -> str:
+        """Let it end, and return what it has said."""
+        self.interrupt()
+        return self.check_end()
 
 
 Published = namedtuple('Published', 'stamp message')
@@ -174,9 +179,9 @@ class User(PrivateNode):
         self.wait(self._of_services[service].service_is_ready, f'service {service}')
         return self._of_services[service]
 
-    def call(self, service: str, kind: type, request: object):
-        """Return a service's answer."""
-        return self.answer(self.client(service, kind).call_async, request)
+    def call(self, service: str, kind: type, request: object = None):
+        """Return a service's answer, to a request without content if none is given."""
+        return self.answer(self.client(service, kind).call_async, request or kind.Request())
 
     def answer(self, ask, *request: object):
         """Return the answer to a request, asked again where it gets lost."""
@@ -231,8 +236,7 @@ class Manager:
         self._user, self._node = user, node
 
     def state(self) -> str:
-        answer = self._user.call(f'{self._node}/get_state', GetState, GetState.Request())
-        return answer.current_state.label
+        return self._user.call(f'{self._node}/get_state', GetState).current_state.label
 
     def change(self, transition: int | str) -> bool:
         by_label = isinstance(transition, str)
@@ -320,7 +324,7 @@ class Estimator(Rig):
         return self
 
     def reset(self):
-        return self.user.call(f'{self.name}/reset', Trigger, Trigger.Request())
+        return self.user.call(f'{self.name}/reset', Trigger)
 
     def send(self, y: float) -> int:
         """Publish one sample and return its source stamp."""

@@ -4,7 +4,6 @@
 import argparse
 from contextlib import suppress
 from errno import ENOSPC
-import os
 from pathlib import Path
 import signal
 import sys
@@ -99,26 +98,6 @@ def test_output_replaces_only_what_is_empty_or_forced_and_only_when_it_is_comple
         pass
 
 
-@pytest.fixture
-def begin():
-    """Return a function that starts Python in a session of its own, SIGINT ignored or not."""
-    started = []
-
-    def begin(*words, ignored):
-        def disposition():
-            signal.signal(signal.SIGINT, signal.SIG_IGN if ignored else signal.default_int_handler)
-            signal.signal(signal.SIGHUP, signal.SIG_DFL)  # these tests under nohup ignore it
-
-        started.append(commands.start(*words, command=[sys.executable], preexec_fn=disposition))
-        return started[-1]
-
-    yield begin
-    for process in started:
-        if process.poll() is None:
-            os.killpg(process.pid, signal.SIGKILL)
-        process.communicate()
-
-
 SLOW = """
 import sys
 from fhaosmo_ros.__main__ import COMMANDS, main
@@ -154,12 +133,20 @@ def main(argv):
     (signal.SIGHUP, False),  # the terminal or the SSH connection closes
 ])  # fmt: skip
 @pytest.mark.parametrize('module', [LOADS, WORKS], ids=['loads', 'works'])
-def test_signal_ends_a_command_that_loads_or_works(begin, tmp_path, module, number, ignored):
+def test_signal_ends_a_command_that_loads_or_works(tmp_path, module, number, ignored):
+    def disposition():
+        signal.signal(signal.SIGINT, signal.SIG_IGN if ignored else signal.default_int_handler)
+        signal.signal(signal.SIGHUP, signal.SIG_DFL)  # these tests under nohup ignore it
+
     (tmp_path / 'slow.py').write_text(module)
-    process = begin('-c', SLOW, tmp_path, ignored=ignored)
-    assert process.stdout.readline() == 'begun\n'
-    process.send_signal(number)
-    _, error = process.communicate(timeout=60)
+    python = {'command': [sys.executable], 'preexec_fn': disposition}
+    with commands.start('-c', SLOW, tmp_path, **python) as process:
+        try:
+            assert process.stdout.readline() == 'begun\n'
+            process.send_signal(number)
+            _, error = process.communicate(timeout=60)
+        finally:
+            process.kill()
     said = '' if module == LOADS else 'slow: warning: odd\nslow: interrupted\n'
     assert (process.returncode, error) == (130, said)
     assert {p.name for p in tmp_path.iterdir()} <= {'slow.py', '__pycache__'}

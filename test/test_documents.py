@@ -3,10 +3,9 @@
 
 import contextlib
 import re
-import subprocess
 import sys
 
-from commands import environment, ROOT
+from commands import ROOT, run
 from fhaosmo_ros import topics
 from fhaosmo_ros.__main__ import main
 from fhaosmo_ros.commands import COMMANDS
@@ -16,6 +15,8 @@ from fhaosmo_ros.core.parameters.files import load
 from fhaosmo_ros.tools.tuning.objective import TUNE_PARAMETERS
 import numpy as np
 import pytest
+import results
+from studies import comparison, everywhere, evidence, paper
 from studies.parameter_reference import markdown
 import yaml
 
@@ -89,8 +90,7 @@ def test_python_runs(page, tmp_path):
     table = np.column_stack([t, 0.5 * np.cos(4.4 * t), np.zeros_like(t)])
     np.savetxt(tmp_path / 'my.csv', table, delimiter=',', header='t,y,u')
     for text in blocks(page, 'python'):
-        command = [sys.executable, '-c', text]
-        subprocess.run(command, cwd=tmp_path, env=environment(), check=True)
+        run('-c', text, command=[sys.executable], cwd=tmp_path).check_returncode()
 
 
 def test_links_paths_and_targets_of_the_documents_lead_somewhere():
@@ -141,9 +141,33 @@ def test_layouts_of_plotjuggler_and_foxglove_show_what_is_published(path):
 def test_site_builds_without_a_warning(tmp_path):
     """Sphinx warns of links, to pages and to places in them, that lead nowhere."""
     pytest.importorskip('myst_parser', reason='sphinx is not installed: extra docs')
-    command = [sys.executable, '-m', 'sphinx', '-W', '--keep-going', '-q', '-d', tmp_path / 'made']
-    done = subprocess.run(
-        [*command, ROOT / 'docs', tmp_path / 'site'], capture_output=True, text=True, check=False
-    )
+    options = ['-W', '--keep-going', '-q', '-d', tmp_path / 'made']
+    sphinx = [sys.executable, '-m', 'sphinx']
+    done = run(*options, ROOT / 'docs', tmp_path / 'site', command=sphinx)
     assert done.returncode == 0, done.stderr
     assert 'Observer.smooth' in (tmp_path / 'site' / 'offline.html').read_text()
+
+
+# docs/evidence.md says what its tables say, and these have the paper's findings.
+MAKERS = {
+    'speed': results, 'comparison': comparison, 'everywhere': everywhere, 'paper': paper,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize('name', MAKERS)
+def test_the_page_says_what_the_table_says(name):
+    shown = evidence.parts((evidence.DOCS / evidence.PAGE).read_text(encoding='utf-8'))
+    texts = MAKERS[name].texts(evidence.read(name))
+    assert {part: shown[part] for part in texts} == texts
+
+
+def test_best_solver_and_all_findings_come_out():
+    rows = evidence.read('paper')
+    documented = {of: paper.scores_of(rows, of) for of in (paper.SOLVER, *paper.EARLIER)}
+
+    def error(solver):
+        return sum(documented[solver][paper.FINE, w]['rms_d'] for w in paper.FREQUENCIES)
+
+    *_, held = paper.EARLIER
+    assert min(set(documented) - {held}, key=error) == paper.SOLVER
+    assert all(v.holds for v in paper.verdicts(documented[paper.SOLVER]))

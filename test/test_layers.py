@@ -2,10 +2,9 @@
 """What import-linter cannot see: imports of compiled modules, and what an import really loads."""
 
 import re
-import subprocess
 import sys
 
-from commands import ROOT
+from commands import ROOT, run
 import pytest
 
 tomllib = pytest.importorskip('tomllib', reason='Python 3.10 has no tomllib')
@@ -37,7 +36,6 @@ print(*{name.split('.')[0] for name in sys.modules})
 
 
 def test_an_estimate_of_the_default_parameters_loads_nothing_slow():
-    done = subprocess.run([sys.executable, '-c', ESTIMATE], capture_output=True, check=True)
-    loaded = set(done.stdout.decode().split())
+    loaded = set(run('-c', ESTIMATE, command=[sys.executable]).stdout.split())
     assert 'numpy' in loaded
     assert not loaded & {'scipy', 'skfuzzy', 'networkx', 'matplotlib', 'rclpy', 'rosbags'}

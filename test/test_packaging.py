@@ -12,6 +12,7 @@ from types import SimpleNamespace
 from unittest.mock import MagicMock
 
 from commands import ROOT
+from commands import run as run_program
 import fhaosmo_ros
 from fhaosmo_ros.__main__ import main
 from fhaosmo_ros.commands import COMMANDS
@@ -24,10 +25,8 @@ SOURCED = ('AMENT_PREFIX_PATH', 'CMAKE_PREFIX_PATH', 'COLCON_PREFIX_PATH', 'ROS_
 
 def attempt(*command: object, cwd=None, **environment: object) -> subprocess.CompletedProcess:
     kept = {k: v for k, v in os.environ.items() if k not in SOURCED}
-    return subprocess.run(
-        [str(part) for part in command], capture_output=True, text=True, cwd=cwd,
-        env=kept | {k: str(v) for k, v in environment.items()}, check=False,
-    )  # fmt: skip
+    own = {name: str(value) for name, value in environment.items()}
+    return run_program(*command, command=(), cwd=cwd, env=kept | own, timeout=None)
 
 
 def run(*command: object, **options: object) -> str:

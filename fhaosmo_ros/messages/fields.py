@@ -8,8 +8,10 @@ a rosbags typestore (``fielddefs``): by type, its constants and its fields as pa
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 import math
 from math import asin, atan2, copysign, pi
+from operator import attrgetter
 import re
 from typing import Any, NamedTuple
 
@@ -34,91 +36,33 @@ MOST_LISTED, LONGEST_LISTED = 10, 60
 SUBSCRIPT = r'\[([^\[\]]+)\]'
 
 
-class Key(NamedTuple):
-    """An element of a list by its name, which stands in another list of the same message."""
-
-    name: str
-    names: str  # field with the names, beside the list
-
-
 class Elements(NamedTuple):
-    """A list in the way to a number, of which the user says the element."""
+    """A list on the way to a number, of which the user says the element."""
 
+    path: str  # from the message that begins the way, or from an element of the list before
+    names: str  # of the list of strings beside it that names the elements, '' if there is none
     length: float  # inf where it is not fixed
-    names: str  # field beside it that holds the elements' names, '' if there is none
 
-    def element(self, text: str) -> int | Key | None:
-        """Return the element that is meant, None if there is no such one."""
-        if text.isdigit():
-            return int(text) if int(text) < self.length else None
-        return Key(text, self.names) if self.names else None
+    def has(self, element: str) -> bool:
+        """Return False for an element that no message can have."""
+        return int(element) < self.length if element.isdecimal() else bool(self.names)
+
+
+Lists = tuple[Elements, ...]
 
 
 class Field(NamedTuple):
     """A number in the messages of a topic."""
 
     text: str  # as the user wrote it: 'angular_velocity.z', 'position[2]' or 'position[elbow]'
-    steps: list[str | int | Key]  # fields and elements of lists, from the message inwards
+    value: Callable[[Any], float]
+    """
+    Returns the number in a message object, of rclpy or of rosbags; raises `MissingElementError`
+    where a list of the message is too short, or lacks the name.
+    """
     header: str  # name of the std_msgs/Header that the message begins with, '' if there is none
-    angle: str = ''  # one of `ANGLES` where the steps lead to the x of a quaternion, else ''
-
-    @property
-    def wraps(self) -> bool:
-        """True for an angle that jumps by a whole turn, unless an `Unwrapper` follows it."""
-        return self.angle in ('roll', 'yaw')
-
-    @property
-    def key(self) -> str:
-        """Name of the element of a list that is meant, '' if it is not meant by name."""
-        return next((s.name for s in reversed(self.steps) if isinstance(s, Key)), '')
-
-    def value(self, message: Any) -> float:
-        """
-        Return the number in a message object, of rclpy or of rosbags.
-
-        Raises
-        ------
-        MissingElementError
-            A list of the message is too short, or lacks the name.
-
-        """
-        around = node = message
-        try:
-            for step in self.steps:
-                if isinstance(step, str):
-                    around, node = node, getattr(node, step)
-                elif isinstance(step, Key):
-                    names = getattr(around, step.names)
-                    node = node[names.index(step.name)]
-                else:
-                    node = node[step]
-        except ValueError:
-            raise MissingElementError(
-                f'field {self.text!r}: expected a name that is in the message '
-                f'({listed(names) or "which has none"}), got {step.name!r}'
-            ) from None
-        except IndexError:
-            raise MissingElementError(
-                f'field {self.text!r}: expected a longer list, got one of {len(node)}'
-            ) from None
-        if self.angle:
-            return angle_of(self.angle, around.x, around.y, around.z, around.w)
-        return float(node[0] if isinstance(node, bytes) else node)  # a byte of rclpy
-
-    def reader(self) -> Callable[[Any], float]:
-        """Return `value`, or the same for an element by its name in half the time."""
-        if [type(step) for step in self.steps] != [str, Key]:
-            return self.value
-        elements, (name, names), value = self.steps[0], self.steps[1], self.value
-
-        def read(message: Any) -> float:
-            try:
-                found = getattr(message, elements)[getattr(message, names).index(name)]
-            except (ValueError, IndexError):
-                return value(message)  # which says what is wrong
-            return found if isinstance(found, float) else value(message)
-
-        return read
+    wraps: bool  # an angle that jumps by a whole turn, unless an `Unwrapper` follows it
+    key: str  # name of the element of a list that is meant, '' if it is not meant by name
 
     def stamp(self, message: Any) -> int:
         """Return the stamp of the header that the message begins with, in nanoseconds."""
@@ -162,7 +106,7 @@ def find_field(
         There is no such field, or it holds no number; the message lists the fields that do.
 
     """
-    known = {path: (steps, angle) for path, steps, angle in _numbers(types, message_type)}
+    known = {path: (lists, angle) for path, lists, angle in _numbers(types, message_type)}
     usual = [path for path in known if not path.endswith(OF_HEADERS)]
     listing = ', '.join(usual) or 'none: it holds no number'
     if not text:
@@ -180,23 +124,28 @@ def find_field(
     path, elements = re.sub(SUBSCRIPT, '[i]', text), re.findall(SUBSCRIPT, text)
     if path not in known and name:
         path, elements = f'{path}[i]', [*elements, name]
-    steps, angle = known.get(path, ((None,), ''))  # None: there is no such number
-    wanted = iter(elements)
-    found = [s.element(next(wanted)) if isinstance(s, Elements) else s for s in steps]
-    if None in found:
+    lists, angle = known.get(path, ((), ''))
+    if path not in known or not all(map(Elements.has, lists, elements)):
         raise ConfigurationError(
             f'field {text!r}: expected a number in {message_type}, one of {listing}, got {text!r}'
             f'{suggestion(text, usual)}'
         )
+    steps = [_element(text, *pair) for pair in zip(lists, elements, strict=True)]
+    if end := path.rpartition('[i]')[2].removesuffix(angle).strip('.'):
+        steps.append(attrgetter(end))
+    if angle:
+        steps.append(partial(_angle, angle))
     fields = types[message_type][1]
     has_header = bool(fields) and tuple(fields[0][1]) == (NAME, HEADER)
-    return Field(text, found, fields[0][0] if has_header else '', angle)
+    key = next((e for e in reversed(elements) if not e.isdecimal()), '')
+    header = fields[0][0] if has_header else ''
+    return Field(text, _number(steps), header, angle in ('roll', 'yaw'), key)
 
 
 def _numbers(
-    types: Mapping[str, Any], message_type: str, prefix: str = '', before: tuple[Any, ...] = ()
-) -> Iterator[tuple[str, tuple[Any, ...], str]]:
-    """Yield path, steps and angle of each number of a type; a list is [i] in a path."""
+    types: Mapping[str, Any], message_type: str, prefix: str = '', before: Lists = ()
+) -> Iterator[tuple[str, Lists, str]]:
+    """Yield path, lists on the way and angle of each number of a type; [i] follows a list."""
     fields = types[message_type][1]
     names = [
         name
@@ -205,22 +154,56 @@ def _numbers(
         and (detail[0][0], detail[0][1][0]) == (BASE, 'string')
         and (name in ('name', 'names') or name.endswith('_names'))
     ]
+    within = prefix.rpartition('[i].')[2]
     for name, (kind, detail) in fields:
-        path, steps = prefix + name, (*before, name)
+        path, lists = prefix + name, before
         if kind in (ARRAY, SEQUENCE):
             length = detail[1] if kind == ARRAY else math.inf
-            path, steps = f'{path}[i]', (*steps, Elements(length, names[0] if names else ''))
+            beside = within + names[0] if names else ''
+            path, lists = f'{path}[i]', (*lists, Elements(within + name, beside, length))
             kind, detail = detail[0]
         if kind == NAME and detail in types:
-            yield from _numbers(types, detail, f'{path}.', steps)
+            yield from _numbers(types, detail, f'{path}.', lists)
         if kind == BASE and detail[0] in NUMBERS:
-            yield path, steps, ''
+            yield path, lists, ''
     if message_type == QUATERNION:
-        yield from ((prefix + angle, (*before, 'x'), angle) for angle in ANGLES)
+        yield from ((prefix + angle, before, angle) for angle in ANGLES)
 
 
-def angle_of(angle: str, x: float, y: float, z: float, w: float) -> float:
+def _number(steps: list[Callable[[Any], Any]]) -> Callable[[Any], float]:
+    """Return a function that goes from a message by some steps to a number."""
+
+    def value(message: Any) -> float:
+        for step in steps:
+            message = step(message)
+        if type(message) is float:  # at 1 kHz
+            return message
+        return float(message[0] if isinstance(message, bytes) else message)  # a byte of rclpy
+
+    return value
+
+
+def _element(text: str, elements: Elements, which: str) -> Callable[[Any], Any]:
+    """Return the step to an element of a list, by its index or its name; `text`: the whole way."""
+    values, names = attrgetter(elements.path), attrgetter(elements.names or elements.path)
+    index = int(which) if which.isdecimal() else None
+
+    def step(message: Any) -> Any:
+        try:
+            return values(message)[names(message).index(which) if index is None else index]
+        except ValueError:
+            present = listed(names(message)) or 'which has none'
+            problem = f'expected a name that is in the message ({present}), got {which!r}'
+        except IndexError:
+            problem = f'expected a longer list, got one of {len(values(message))}'
+        raise MissingElementError(f'field {text!r}: {problem}')
+
+    return step
+
+
+def _angle(angle: str, quaternion: Any) -> float:
     """Return roll, pitch or yaw of a quaternion of any length, in rad (NaN of a zero one)."""
+    x, y, z, w = quaternion.x, quaternion.y, quaternion.z, quaternion.w
     n = x * x + y * y + z * z + w * w
     if not n > 0.0:
         return float('nan')

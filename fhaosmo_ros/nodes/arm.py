@@ -10,15 +10,12 @@ from diagnostic_msgs.msg import DiagnosticArray
 from fhaosmo_ros.core.arm.arm import ANEW, Arm, ArmEstimate, payload_of, text_of
 from fhaosmo_ros.core.parameters.declaration import Parameters, Value
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
-from fhaosmo_ros.core.parameters.files import complete
-from fhaosmo_ros.core.parameters.tables import ARM_NODE_PARAMETERS
 from fhaosmo_ros.messages.joints import joint_sample
 from fhaosmo_ros.nodes.middleware import diagnostics, endpoints
 from fhaosmo_ros.nodes.middleware.diagnostics import ERROR, OK, QUIET, STALE, WARN
 from fhaosmo_ros.nodes.middleware.endpoints import LATCHED, SENSOR_QOS
 from fhaosmo_ros.nodes.middleware.messages import time_message
-from fhaosmo_ros.nodes.middleware.parameters import built_in, NodeParameters
-from fhaosmo_ros.nodes.middleware.simulated_time import TimedNode
+from fhaosmo_ros.nodes.middleware.node import BaseNode
 from fhaosmo_ros.nodes.middleware.spin import run_node
 from geometry_msgs.msg import Vector3, WrenchStamped
 import numpy as np
@@ -61,7 +58,7 @@ MEANT = {
 """What the counters of `Arm` mean."""
 
 
-class ArmNode(TimedNode):
+class ArmNode(BaseNode):
     """
     Estimates external torques, from the first sample after the robot's description on.
 
@@ -69,14 +66,10 @@ class ArmNode(TimedNode):
     ConfigurationError; what a topic delivers and can't be used is logged, reported and survived.
     """
 
-    def __init__(self, given: Mapping[str, Any] | None = None, **options: Any) -> None:
-        given = given or {}
-        values = complete(given, ARM_NODE_PARAMETERS)
-        super().__init__(
-            'arm', parameter_overrides=built_in(given), enable_logger_service=True, **options
-        )
-        endpoints.check_overrides(self, given, [f'~/{topic}' for topic in TOPICS])
-        self._values = values
+    def __init__(self, given: Mapping[str, Any]) -> None:
+        super().__init__('arm', given)
+        values = self.values
+        endpoints.check_overrides(self, [f'~/{topic}' for topic in TOPICS])
         self._arm: Arm | None = None
         self._description = ''
         self._problems: dict[str, str] = {}  # of each kind the last one, since the last report
@@ -90,7 +83,6 @@ class ArmNode(TimedNode):
             if topic != 'external_wrench' or values['wrench_frame']
         }
         self._listeners = endpoints.Listeners(self._outputs)
-        NodeParameters(self, values, self._prepare, self._adopt)
         if values['robot_description_file']:
             self._use(text_of(values, 'robot_description_file', 'a URDF'))
         else:
@@ -100,11 +92,11 @@ class ArmNode(TimedNode):
         self.create_subscription(JointState, values['input_topic'], self._on_sample, SENSOR_QOS)
         for name in SERVICES:
             self.create_service(Trigger, f'~/{name}', partial(self._serve, name))
-        self._diagnostics = diagnostics.DiagnosticsPublisher(self, self._reports, values)
+        self._diagnostics = diagnostics.publish_diagnostics(self, self._reports)
 
     def _use(self, urdf: str) -> None:
         """Begin to estimate for this robot."""
-        values = self._values
+        values = self.values
         arm = Arm(urdf, values)
         if values['wrench_frame']:  # raises for an unknown one
             arm.model.frame_jacobian(np.zeros(len(arm.joints)), values['wrench_frame'])
@@ -149,7 +141,7 @@ class ArmNode(TimedNode):
             self._publish(arm, estimate)
 
     def _publish(self, arm: Arm, estimate: ArmEstimate) -> None:
-        period = 1e9 / self._values['publish_rate']
+        period = 1e9 / self.values['publish_rate']
         # Half a sample early rather than one late: rates that divide each other stay as they are.
         if 0.0 <= estimate.stamp - self._published < 0.9 * period:
             return
@@ -162,7 +154,7 @@ class ArmNode(TimedNode):
                     setattr(message, field, getattr(estimate, of_estimate).tolist())
                 heard[topic].publish(message)
         if publisher := heard.get('external_wrench'):
-            frame = self._values['wrench_frame']
+            frame = self.values['wrench_frame']
             (wrench, near_singular), message = arm.wrench(estimate, frame), WrenchStamped()
             if near_singular:
                 self._problems['near'] = 'near a singular posture: part of the wrench is not seen'
@@ -192,7 +184,7 @@ class ArmNode(TimedNode):
         report.find(level, text)
         report.values = values
         when = time_message(stamp) if stamp else self.get_clock().now().to_msg()
-        message = diagnostics.array_of(self, when, [report], self._values['hardware_id'])
+        message = diagnostics.array_of(self, when, [report])
         self._outputs['event'].publish(message)
 
     def _warn(self, text: str) -> None:
@@ -213,7 +205,7 @@ class ArmNode(TimedNode):
             return [report]
         silent = perf_counter() - self._latest
         if not silent < SILENT:
-            topic = self.resolve_topic_name(self._values['input_topic'])
+            topic = self.resolve_topic_name(self.values['input_topic'])
             since = f'for {silent:.3g} s' if np.isfinite(silent) else 'yet'
             report.find(ERROR, f'no usable sample on {topic} {since}: nothing is published')
             if self._contact:
@@ -230,10 +222,9 @@ class ArmNode(TimedNode):
         return values
 
     def _adopt(self, values: Parameters) -> None:
-        self._values = values
         if self._arm is not None:
             self._arm.adopt(values)
-        self._diagnostics.adopt(values)
+        endpoints.set_period(self._diagnostics, values['diagnostics_period'])
 
     def _serve(
         self, name: str, _: Trigger.Request, response: Trigger.Response

@@ -7,13 +7,10 @@ import math
 from typing import Any
 
 from fhaosmo_ros.core.parameters.declaration import Parameters, Value
-from fhaosmo_ros.core.parameters.files import complete
-from fhaosmo_ros.core.parameters.tables import PLANT_NODE_PARAMETERS
 from fhaosmo_ros.core.simulation.plant import Plant
 from fhaosmo_ros.nodes.middleware.endpoints import check_overrides, create_publisher, set_period
 from fhaosmo_ros.nodes.middleware.messages import labelled
-from fhaosmo_ros.nodes.middleware.parameters import built_in, NodeParameters
-from fhaosmo_ros.nodes.middleware.simulated_time import TimedNode
+from fhaosmo_ros.nodes.middleware.node import BaseNode
 from fhaosmo_ros.nodes.middleware.spin import run_node
 import numpy as np
 from std_msgs.msg import Float64, Float64MultiArray
@@ -23,7 +20,7 @@ MAX_PAUSE = 1_000_000_000
 TOPICS = {'y': Float64, '~/state': Float64MultiArray, '~/unknown_input': Float64}
 
 
-class PlantNode(TimedNode):
+class PlantNode(BaseNode):
     """
     Publishes ``y``, ``~/state`` and ``~/unknown_input`` at `sample_rate`.
 
@@ -32,18 +29,15 @@ class PlantNode(TimedNode):
     rclpy's own such as use_sim_time; those that can't be used raise ConfigurationError.
     """
 
-    def __init__(self, given: Mapping[str, Any] | None = None, **options: Any) -> None:
-        given = given or {}
-        values = complete(given, PLANT_NODE_PARAMETERS)
+    def __init__(self, given: Mapping[str, Any]) -> None:
+        super().__init__('plant', given)
+        values = self.values
         self.plant = Plant(values)
-        super().__init__(
-            'plant', parameter_overrides=built_in(given), enable_logger_service=True, **options
-        )
         self._u = [0.0] * len(self.plant.model.inputs)
-        self._origin: int | None = None
-        self._now = 0
+        self._now: int | None = None  # of the node's clock, in ns, and the time of the plant
+        self._time = 0
         self._state_message = labelled([f'z{i + 1}' for i in range(self.plant.order)])
-        check_overrides(self, given, TOPICS)
+        check_overrides(self, TOPICS)
         self._publish_y, self._publish_state, self._publish_d = (
             create_publisher(self, kind, topic).publish for topic, kind in TOPICS.items()
         )
@@ -51,7 +45,6 @@ class PlantNode(TimedNode):
             if name in self.plant.model.used_inputs:
                 take = partial(self._on_input, index, name)
                 self.create_subscription(Float64, name, take, 10)
-        NodeParameters(self, values, self._prepare, self._adopt)
         self.plant.sample(0.0)
         self._timer = self.create_timer(1.0 / values['sample_rate'], self._tick)
         self.get_logger().info(
@@ -87,17 +80,15 @@ class PlantNode(TimedNode):
 
     def _plant_time(self, now: int) -> float:
         """Return the plant's time in seconds; it stands still while the clock jumps."""
-        if self._origin is None:
-            self._origin = now
-        elif not 0 <= now - self._now <= MAX_PAUSE:
+        step = 0 if self._now is None else now - self._now
+        if not 0 <= step <= MAX_PAUSE:
             self.get_logger().warning(
-                f'the clock jumped by {(now - self._now) * 1e-9:.3g} s: the plant goes on from '
-                'where it was',
+                f'the clock jumped by {step * 1e-9:.3g} s: the plant goes on from where it was',
                 throttle_duration_sec=5.0,
             )
-            self._origin += now - self._now
-        self._now = now
-        return (now - self._origin) * 1e-9
+            step = 0
+        self._now, self._time = now, self._time + step
+        return self._time * 1e-9
 
     def _on_input(self, index: int, name: str, message: Float64) -> None:
         if math.isfinite(message.data):
@@ -110,12 +101,11 @@ class PlantNode(TimedNode):
             )
 
     def _prepare(self, values: Parameters, changes: Mapping[str, Value]) -> Any:
-        return values, self.plant.prepare(values), 'noise_seed' in changes
+        return self.plant.prepare(values), 'noise_seed' in changes  # also the same seed
 
     def _adopt(self, change: Any) -> None:
-        values, simulation, noise_anew = change  # also with the same seed
-        self.plant.adopt(simulation, noise_anew)
-        set_period(self._timer, 1.0 / values['sample_rate'])
+        self.plant.adopt(*change)
+        set_period(self._timer, 1.0 / self.values['sample_rate'])
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -12,7 +12,7 @@ from typing import Any
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.nodes.middleware.endpoints import SequenceNumbers, subscribe_with_info
 from fhaosmo_ros.nodes.middleware.messages import message_class
-from fhaosmo_ros.nodes.middleware.spin import GRACE, of_rcl, Spinner
+from fhaosmo_ros.nodes.middleware.spin import of_rcl, Spinner
 from fhaosmo_ros.topics import OF_ALL_NODES
 import rclpy
 from rclpy.context import Context
@@ -43,27 +43,20 @@ class PrivateNode(Spinner):
     A `node` in a context of its own, without signal handlers; spun while open.
 
     `ros_arguments` are what launch gives to every node behind ``--ros-args``: names, remappings,
-    enclave. For `grace` see `Spinner`.
+    enclave.
     """
 
-    def __init__(
-        self, name: str, ros_arguments: Sequence[str] = (), grace: float | None = GRACE
-    ) -> None:
-        self._context, given = Context(), ['--ros-args', *ros_arguments]
+    def __init__(self, name: str, ros_arguments: Sequence[str] = ()) -> None:
+        context, given = Context(), ['--ros-args', *ros_arguments]
         no_handlers = SignalHandlerOptions.NO
         try:
-            rclpy.init(args=given, context=self._context, signal_handler_options=no_handlers)
-            self.node = Node(name, context=self._context)
+            rclpy.init(args=given, context=context, signal_handler_options=no_handlers)
+            node = Node(name, context=context)
         except (RuntimeError, ParameterException) as error:
             problem = of_rcl(error)
             raise ConfigurationError(f'ROS arguments {shlex.join(given)}: {problem}') from None
-        self._client = cache(partial(AsyncParameterClient, self.node))  # by the name of its node
-        super().__init__(self.node, grace=grace)
-
-    def __exit__(self, *error: object) -> None:
-        super().__exit__(*error)
-        self.node.destroy_node()
-        rclpy.try_shutdown(context=self._context)
+        self._client = cache(partial(AsyncParameterClient, node))  # by the name of its node
+        super().__init__(node)
 
     def set_parameters(self, node: str, values: Mapping[str, Any]) -> None:
         """Ask another node to change parameters; what it answers is not waited for."""
@@ -118,6 +111,8 @@ class TopicRecorder(PrivateNode):
 
     """
 
+    grace = None  # what is being written is written before the bag is closed
+
     def __init__(
         self,
         bag: Any,
@@ -126,8 +121,7 @@ class TopicRecorder(PrivateNode):
         everything: bool = False,
         ros_arguments: Sequence[str] = (),
     ) -> None:
-        # Without a limit of time, what is being written is written before the bag is closed.
-        super().__init__('fhaosmo_recorder', ros_arguments, grace=None)
+        super().__init__('fhaosmo_recorder', ros_arguments)
         self.counts: Counter[str] = Counter()
         self._numbers: dict[str, SequenceNumbers] = {}
         self.problems: list[str] = []
@@ -137,7 +131,6 @@ class TopicRecorder(PrivateNode):
         self._topics = {resolved(name) for name in [*topics, *(OF_NODES if nodes else ())]}
         self._begin = time_ns()
         self._seen: set[str] = set()
-        self._failed: OSError | None = None
 
     def __enter__(self) -> 'TopicRecorder':
         self._discover()
@@ -153,16 +146,16 @@ class TopicRecorder(PrivateNode):
 
     def check(self) -> None:
         """Raise what ended the recording: of the system, such as a full disk, or of a callback."""
-        if error := self._failed or self.error:
-            raise error
+        if self.error:
+            raise self.error
 
     def _write(self, write: Callable[..., Any], *arguments: Any) -> Any:
         """Write until that fails: rclpy would print the stack of what a callback raises."""
-        if self._failed is None:
+        if self.error is None:
             try:
                 return write(*arguments)
             except OSError as error:
-                self._failed = error
+                self.error = error
         return None
 
     def _discover(self) -> None:

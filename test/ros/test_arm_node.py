@@ -125,7 +125,7 @@ def test_tare_payload_and_a_second_robot(limb, user):
     limb.description.publish(String(data=URDF.replace('three', 'other')))
     limb.wait_said('a second robot on /limb/robot_description is ignored')
     limb.estimate(range(1202, 1500), 2.0)
-    assert user.call(f'{limb.name}/tare', Trigger, Trigger.Request()).success
+    assert user.call(f'{limb.name}/tare', Trigger).success
     for samples in (range(1500, 1501), range(1501, 1700)):  # at once, and later
         assert np.abs(limb.estimate(samples, 2.0)).max() < 0.5
     parameters = Parameters(user, limb.name)
@@ -135,7 +135,7 @@ def test_tare_payload_and_a_second_robot(limb, user):
     found = limb.estimate(range(1700, 1900), 2.0)
     weight = -9.81 * np.sin(MOTION[1][1899][1:].cumsum()) @ [[0.4, 0.0], [0.4, 0.4]]
     np.testing.assert_allclose(found, [0.0, *weight], atol=0.3 * np.abs(weight).max())
-    assert user.call(f'{limb.name}/reset', Trigger, Trigger.Request()).success
+    assert user.call(f'{limb.name}/reset', Trigger).success
 
 
 def test_a_robot_of_a_file_and_a_wrong_setting_which_stops_the_estimates(launch, user, tmp_path):

@@ -107,7 +107,7 @@ def test_reset_that_waits_during_cleanup_does_not_end_the_node(user, unconfigure
     change, cleanup = user.client(f'{NODE}/change_state', ChangeState), Transition(label='cleanup')
     for _ in range(3):
         assert unconfigured.change('configure')
-        user.call(f'{NODE}/reset', Trigger, Trigger.Request())
+        user.call(f'{NODE}/reset', Trigger)
         reset = user.client(f'{NODE}/reset', Trigger)
         change.call_async(ChangeState.Request(transition=cleanup))
         for _ in range(20):

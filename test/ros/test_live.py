@@ -110,7 +110,7 @@ def rigs(user, launch):
 
 def test_each_channel_is_bit_for_bit_an_estimator_of_its_own(user, rigs):
     """Also where hip alone is reset, and a common parameter changes that serves only knee."""
-    assert user.call('/many/estimator/reset', Trigger, Trigger.Request()).success
+    assert user.call('/many/estimator/reset', Trigger).success
     estimators = {name: OnlineEstimator(COMMON | own) for name, own in OWN.items()}
     for k in range(50):
         if k == 25:

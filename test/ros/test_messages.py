@@ -132,8 +132,7 @@ def test_known_input_of_another_topic_is_that_of_the_stamp_of_y(user, estimator,
     send_u(stamps[-1], 4.0)
     user.wait(lambda: rig.value('late inputs') == '1', 'count of late inputs')
     assert rig.count('rejected inputs') == len(stamps) - 1
-    process.interrupt()
-    process.check_end()
+    process.stop()
     # Nothing is said to replay: the bag says what y and u are.
     assert main(['replay', str(tmp_path / 'bag'), '-o', str(tmp_path / 'out.npz')]) == 0
     with np.load(tmp_path / 'out.npz') as replayed:

@@ -162,10 +162,9 @@ class Channel:
 
     def _say(self, stamp: int, text: str, level: bytes = OK, values: Any = None) -> None:
         """Publish on the topic of events."""
-        report = Report(f'{self.name} event'.lstrip(), values)
+        report = Report(f'{self.name} event'.lstrip(), values or {})
         report.find(level, text)
-        hardware_id, time = self.values['hardware_id'], time_message(stamp)
-        self._events.publish(array_of(self._node, time, [report], hardware_id))
+        self._events.publish(array_of(self._node, time_message(stamp), [report]))
 
     def reset(self, _: Trigger.Request | None = None) -> str:
         """Start the observer afresh with the next sample; return what has been done."""

@@ -24,9 +24,9 @@ from fhaosmo_ros.nodes.estimator.channel import Channel
 from fhaosmo_ros.nodes.estimator.outputs import parameter_text, TypedOutputs
 from fhaosmo_ros.nodes.estimator.sources import check_inputs, Sources
 from fhaosmo_ros.nodes.middleware.diagnostics import (
-    DiagnosticsPublisher,
     ERROR,
     OK,
+    publish_diagnostics,
     Report,
     ReportLog,
     STALE,
@@ -34,7 +34,6 @@ from fhaosmo_ros.nodes.middleware.diagnostics import (
 )
 from fhaosmo_ros.nodes.middleware.endpoints import check_overrides, full_name, set_period
 from fhaosmo_ros.nodes.middleware.lifecycle import ManagedNode
-from fhaosmo_ros.nodes.middleware.parameters import built_in, NodeParameters
 from fhaosmo_ros.nodes.middleware.spin import run_node
 from fhaosmo_ros.topics import estimates_of, EVENT, PARAMETERS, STANDARD_DEVIATION
 from rclpy.parameter import Parameter as RosParameter
@@ -55,25 +54,19 @@ class EstimatorNode(ManagedNode):
     used raise ConfigurationError before anything is subscribed or published.
     """
 
-    def __init__(self, given: Mapping[str, Any] | None = None, **options: Any) -> None:
-        given = dict(given or {})
+    def __init__(self, given: Mapping[str, Any]) -> None:
+        given = with_joints(given)
         # In simulated time the middleware's stamps are of no use, but those of headers are.
         self._chooses_sampling = given.get('use_sim_time') is True and 'sampling' not in given
         if self._chooses_sampling:
             given['sampling'] = 'clock'
-        values = complete(with_joints(given), ESTIMATOR_PARAMETERS)
-        super().__init__(
-            'estimator', parameter_overrides=built_in(given), enable_logger_service=True, **options
-        )
-        self._given = given
+        super().__init__('estimator', given, fixed=['autostart', CHANNELS])
+        values = self.values
         self._joints: set[str] = set()  # of the message that the names come from
         self._left_out: list[str] = []  # what is said of those that are no channels
         self._channels: list[Channel] = []  # none before the names of the joints are known
         self._parameters_topic: Any = None
-        self._node_parameters = NodeParameters(
-            self, values, self._prepare, self._adopt, fixed=['autostart', CHANNELS]
-        )
-        self._diagnostics = DiagnosticsPublisher(self, self._reports, values)
+        self._diagnostics = publish_diagnostics(self, self._reports)
         try:
             if values['autostart']:
                 self.start()
@@ -86,7 +79,7 @@ class EstimatorNode(ManagedNode):
 
     def _new_channels(self) -> list[Channel]:
         """Return new channels; raise for parameters that do not fit together."""
-        values = self._node_parameters.values
+        values = self.values
         names: list[str] = values[CHANNELS]
         if names == FROM_JOINTS:  # which joints there are is not known yet, but some may be named
             names = [*names, *with_own_parameters(names, values)]
@@ -98,7 +91,7 @@ class EstimatorNode(ManagedNode):
             topics = [*estimates_of(channel.values), EVENT]
             estimates += [channel.prefix + topic for topic in topics]
         check_inputs(self, inputs)
-        check_overrides(self, self._given, estimates, [wanted.topic for wanted in inputs])
+        check_overrides(self, estimates, [wanted.topic for wanted in inputs])
         axes = [channel.values['output_axis'] for channel in channels[: len(values[CHANNELS])]]
         if {'wrench', 'accel'} & set(values['typed_outputs']) and len(set(axes)) < len(axes):
             raise ConfigurationError(
@@ -109,7 +102,7 @@ class EstimatorNode(ManagedNode):
 
     def configure(self) -> None:
         """Make the channel, or channels, from the present parameters."""
-        values = self._node_parameters.values
+        values = self.values
         channels = self._new_channels()
         self.sources = Sources(self, self._found_type)
         latest = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -127,12 +120,12 @@ class EstimatorNode(ManagedNode):
 
     def _publish_parameters(self) -> None:
         if self._parameters_topic is not None:
-            text = parameter_text(self, self._node_parameters.values, self._channels)
+            text = parameter_text(self, self.values, self._channels)
             self._parameters_topic.publish(String(data=text))
 
     def _open(self, channels: list[Channel]) -> None:
         """Open channels, and what they share."""
-        values = self._node_parameters.values
+        values = self.values
         self._timer = self.create_timer(1.0 / values['publish_rate'], self._tick)
         self._timer.cancel()
         self.typed = TypedOutputs(self, values)
@@ -159,7 +152,7 @@ class EstimatorNode(ManagedNode):
         """Make the channels from the first names; later, report once those that are new."""
         if not isinstance(names, list) or self._joints.issuperset(names):  # at 1 kHz
             return
-        present, log = self._node_parameters.values, self.get_logger()
+        present, log = self.values, self.get_logger()
         if present[CHANNELS] != FROM_JOINTS:
             self.sources.of(measured_output(present)).on_names = None
             new = [name for name in names if name not in self._joints]
@@ -183,7 +176,7 @@ class EstimatorNode(ManagedNode):
             CHANNELS: fit,
         }, ESTIMATOR_PARAMETERS)  # fmt: skip
         self._joints = set(names)
-        self._node_parameters.extend(values)
+        self.extend(values)
         try:
             self._open(self._new_channels())
         except ConfigurationError as error:
@@ -242,7 +235,7 @@ class EstimatorNode(ManagedNode):
         """Raise for changes that can not be, with the name of the channel."""
         if not self._channels:  # whether the values fit together is checked by configure
             return
-        present = self._node_parameters.values
+        present = self.values
         for name, value in changes.items():
             if not values.table[name].live and value != present[name]:
                 raise ConfigurationError(
@@ -254,13 +247,13 @@ class EstimatorNode(ManagedNode):
                 channel.estimator.prepare(of_channel(values, channel.name))
 
     def _adopt(self, _: None) -> None:
-        values = self._node_parameters.values
+        values = self.values
         for channel in self._channels:
             channel.adopt(of_channel(values, channel.name))
         if self._channels:
             set_period(self._timer, 1.0 / values['publish_rate'])
         self._publish_parameters()
-        self._diagnostics.adopt(values)
+        set_period(self._diagnostics, values['diagnostics_period'])
 
     def _reports(self) -> list[Report]:
         state = Report('state')

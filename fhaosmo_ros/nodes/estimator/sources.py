@@ -57,7 +57,7 @@ class Listener:
         except ConfigurationError as error:
             self.error = str(error)
             return
-        self.field, self.stamps, self.value = field, self.wanted.stamp, field.reader()
+        self.field, self.stamps, self.value = field, self.wanted.stamp, field.value
         if self.stamps == 'auto':
             self.stamps = 'header' if field.header else 'source'
         if field.wraps:

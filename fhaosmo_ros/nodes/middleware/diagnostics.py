@@ -7,16 +7,17 @@ tested without an installed ROS. Reports follow the host's steady clock, so that
 they still come when /clock stops.
 """
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
 import re
 from time import monotonic
 from typing import Any
 
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from fhaosmo_ros.nodes.middleware.endpoints import set_period
+from fhaosmo_ros.nodes.middleware.node import BaseNode
 from rclpy.clock import Clock, ClockType
-from rclpy.node import Node
+from rclpy.timer import Timer
 
 OK, WARN = DiagnosticStatus.OK, DiagnosticStatus.WARN
 ERROR, STALE = DiagnosticStatus.ERROR, DiagnosticStatus.STALE
@@ -24,29 +25,28 @@ QUIET, BEGIN = 5.0, 5.0
 """Seconds."""
 
 
+@dataclass
 class Report:
     """One status of /diagnostics, 'node: task': values, findings, and the worst level of these."""
 
-    def __init__(self, task: str, values: Mapping[str, Any] | None = None) -> None:
-        self.task, self.level = task, OK
-        self.values = dict(values or {})
-        self._findings: list[str] = []
+    task: str
+    values: dict[str, Any] = field(default_factory=dict)
+    findings: list[str] = field(default_factory=list)
+    level: bytes = OK
 
     def find(self, level: bytes, text: str, when: object = True) -> None:
         """Add a finding where `when` is true; the status gets the worst level and all texts."""
         if when:
             self.level = max(self.level, level)
-            self._findings.append(text)
+            self.findings.append(text)
 
     @property
     def text(self) -> str:
         """All findings in a line."""
-        return '; '.join(self._findings) or 'OK'
+        return '; '.join(self.findings) or 'OK'
 
 
-def array_of(
-    node: Node, stamp: Time, reports: Iterable[Report], hardware_id: str
-) -> DiagnosticArray:
+def array_of(node: BaseNode, stamp: Time, reports: Iterable[Report]) -> DiagnosticArray:
     """Return reports of a node as one message."""
     name, message = node.get_fully_qualified_name().lstrip('/'), DiagnosticArray()
     message.header.stamp = stamp
@@ -57,7 +57,7 @@ def array_of(
         ]
         message.status.append(DiagnosticStatus(
             level=report.level, name=f'{name}: {report.task}', message=report.text,
-            hardware_id=hardware_id, values=values,
+            hardware_id=node.values['hardware_id'], values=values,
         ))  # fmt: skip
     return message
 
@@ -70,7 +70,7 @@ class ReportLog:
     to find each other.
     """
 
-    def __init__(self, node: Node) -> None:
+    def __init__(self, node: BaseNode) -> None:
         self._logger = node.get_logger()
         self._begun = monotonic() + BEGIN
         self._latest: dict[str, str] = {}  # by task: what the report before has said
@@ -94,23 +94,16 @@ class ReportLog:
                 self._quiet[kind] = now + QUIET
 
 
-class DiagnosticsPublisher:
-    """Publishes what `reports` returns each `diagnostics_period` of the host's steady clock."""
+def publish_diagnostics(node: BaseNode, reports: Callable[[], Iterable[Report]]) -> Timer:
+    """
+    Publish what `reports` returns each `diagnostics_period` of the host's steady clock.
 
-    def __init__(
-        self, node: Node, reports: Callable[[], Iterable[Report]], values: Mapping[str, Any]
-    ) -> None:
-        self._node, self._reports, self._hardware_id = node, reports, values['hardware_id']
-        self._publisher = node.create_publisher(DiagnosticArray, '/diagnostics', 10)
-        clock = Clock(clock_type=ClockType.STEADY_TIME)
-        self._timer = node.create_timer(values['diagnostics_period'], self._publish, clock=clock)
+    Returns the timer; the node changes its period.
+    """
+    publisher = node.create_publisher(DiagnosticArray, '/diagnostics', 10)
 
-    def adopt(self, values: Mapping[str, Any]) -> None:
-        """Go on with other values of its parameters."""
-        set_period(self._timer, values['diagnostics_period'])
-        self._hardware_id = values['hardware_id']
+    def publish() -> None:
+        publisher.publish(array_of(node, node.get_clock().now().to_msg(), reports()))
 
-    def _publish(self) -> None:
-        """Publish all present reports."""
-        stamp = self._node.get_clock().now().to_msg()
-        self._publisher.publish(array_of(self._node, stamp, self._reports(), self._hardware_id))
+    clock = Clock(clock_type=ClockType.STEADY_TIME)
+    return node.create_timer(node.values['diagnostics_period'], publish, clock=clock)

@@ -10,6 +10,7 @@ from time import monotonic
 from typing import Any
 
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
+from fhaosmo_ros.nodes.middleware.node import BaseNode
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSPolicyKind, QoSProfile, ReliabilityPolicy
@@ -83,20 +84,20 @@ def full_name(node: Node, topic: str, what: str = '') -> str:
 
 
 def check_overrides(
-    node: Node, given: Mapping[str, Any], published: Iterable[str], subscribed: Iterable[str] = ()
+    node: BaseNode, published: Iterable[str], subscribed: Iterable[str] = ()
 ) -> None:
     """
     Raise for QoS overrides that rclpy would ignore, or refuse with an unclear message.
 
-    `given` is all that files and the command line set, `published` and `subscribed` are all topics
-    whose publishers and subscriptions the node makes `OVERRIDABLE`.
+    `published` and `subscribed` are all topics whose publishers and subscriptions the node makes
+    `OVERRIDABLE`.
     """
     endpoints = [
         *(f'{full_name(node, topic)}.publisher' for topic in published),
         *(f'{full_name(node, topic)}.subscription' for topic in dict.fromkeys(subscribed)),
     ]
     policies = {policy.name.lower(): allowed for policy, allowed in POLICIES.items()}
-    for name, value in given.items():
+    for name, value in node.given.items():
         if not name.startswith(OVERRIDES) or name.startswith(OF_RCLPY):
             continue
         endpoint, _, policy = name.removeprefix(OVERRIDES).rpartition('.')

@@ -6,14 +6,15 @@ from traceback import format_exception
 from typing import Any
 
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
-from fhaosmo_ros.nodes.middleware.simulated_time import TimedNode
+from fhaosmo_ros.nodes.middleware.node import BaseNode
 from lifecycle_msgs.srv import ChangeState
-from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.lifecycle import LifecycleNodeMixin, LifecycleState, TransitionCallbackReturn
 
 SUCCESS = TransitionCallbackReturn.SUCCESS
+KINDS = ('publisher', 'subscription', 'service', 'timer')
 
 
-class ManagedNode(LifecycleNode, TimedNode):
+class ManagedNode(LifecycleNodeMixin, BaseNode):
     """
     A managed node (ROS 2 lifecycle) that says why a transition failed.
 
@@ -23,8 +24,9 @@ class ManagedNode(LifecycleNode, TimedNode):
     cleanup, and if `configure` fails.
     """
 
-    def __init__(self, name: str, **options: Any) -> None:
-        super().__init__(name, **options)
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        BaseNode.__init__(self, *arguments, **options)
+        LifecycleNodeMixin.__init__(self)
         self._error: Exception | None = None
         self._lasting: set[Any] = set()
         service = next(s for s in self.services if s.service_name.endswith('/change_state'))
@@ -50,9 +52,9 @@ class ManagedNode(LifecycleNode, TimedNode):
     def cleanup(self) -> None:
         """Stop working and destroy what was made since `configure` began, all or part of it."""
         self.deactivate()
-        for entity, destroy in self._entities().items():
+        for entity, kind in self._entities().items():
             if entity not in self._lasting:
-                destroy(entity)
+                getattr(self, f'destroy_{kind}')(entity)
 
     def start(self) -> None:
         """Configure and activate at once; raise what `configure` or `activate` raised."""
@@ -92,16 +94,11 @@ class ManagedNode(LifecycleNode, TimedNode):
             return TransitionCallbackReturn.FAILURE
         return SUCCESS
 
-    def _entities(self) -> dict[Any, Callable[[Any], object]]:
-        """Return what the node has in ROS, each with what destroys it."""
+    def _entities(self) -> dict[Any, str]:
+        """Return what the node has in ROS, with the kind of each."""
+        found = {entity: kind for kind in KINDS for entity in getattr(self, f'{kind}s')}
         clock = self.resolve_topic_name('/clock')  # rclpy's own, also made later
-        subscriptions = [s for s in self.subscriptions if s.topic_name != clock]
-        return {
-            **dict.fromkeys(self.publishers, self.destroy_publisher),
-            **dict.fromkeys(subscriptions, self.destroy_subscription),
-            **dict.fromkeys(self.services, self.destroy_service),
-            **dict.fromkeys(self.timers, self.destroy_timer),
-        }
+        return {e: kind for e, kind in found.items() if getattr(e, 'topic_name', '') != clock}
 
     def _change_state(self, request: ChangeState.Request, response: Any) -> Any:
         """Do what rclpy's service does, and log how it went."""

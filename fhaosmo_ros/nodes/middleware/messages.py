@@ -15,6 +15,7 @@ from typing import Any
 from builtin_interfaces.msg import Time
 from fhaosmo_ros.messages.fields import ARRAY, BASE, NAME, SEQUENCE
 from numpy.typing import NDArray
+from rosidl_parser.definition import AbstractNestedType, NamespacedType
 from std_msgs.msg import Float64MultiArray, MultiArrayDimension
 
 OTHER_NAMES = {'double': 'float64', 'float': 'float32', 'boolean': 'bool'}
@@ -91,20 +92,19 @@ def definitions(message_type: str) -> dict[str, Any]:
         name = waiting.pop()
         if name in found:
             continue
-        fields = message_class(name).get_fields_and_field_types()
-        found[name] = [], [(field, _node(text, waiting)) for field, text in fields.items()]
+        kind = message_class(name)
+        fields = zip(kind.get_fields_and_field_types(), kind.SLOT_TYPES, strict=True)
+        found[name] = [], [(field, _node(its, waiting)) for field, its in fields]
     return found
 
 
-def _node(text: str, others: list[str]) -> Any:
+def _node(kind: Any, others: list[str]) -> Any:
     """Return the definition of a field; add the message types that it needs to `others`."""
-    if inner := re.fullmatch(r'sequence<(.+?)(?:, *(\d+))?>', text):
-        return SEQUENCE, (_node(inner[1], others), int(inner[2] or 0))
-    if inner := re.fullmatch(r'(.+)\[(\d+)\]', text):
-        return ARRAY, (_node(inner[1], others), int(inner[2]))
-    if '/' in text:
-        name = text.replace('/', '/msg/')
-        others.append(name)
-        return NAME, name
-    kind = re.sub(r'<\d+>', '', text)  # string<10>
-    return BASE, (OTHER_NAMES.get(kind, kind), 0)
+    if isinstance(kind, AbstractNestedType):
+        size = getattr(kind, 'size', 0)
+        return ARRAY if size else SEQUENCE, (_node(kind.value_type, others), size)
+    if isinstance(kind, NamespacedType):
+        others.append('/'.join(kind.namespaced_name()))
+        return NAME, others[-1]
+    name = getattr(kind, 'typename', 'string')
+    return BASE, (OTHER_NAMES.get(name, name), 0)

@@ -9,7 +9,7 @@ import re
 import sys
 import threading
 import traceback
-from typing import TypeVar
+from typing import Any
 
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.files import with_origin
@@ -17,7 +17,7 @@ from fhaosmo_ros.nodes.middleware.arguments import help_of, Origins, read_argume
 from fhaosmo_ros.stop_signals import stop_on_signals, Stopped
 import rclpy
 from rclpy.exceptions import InvalidHandle
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
@@ -27,9 +27,6 @@ try:
 except ImportError:  # an older rclpy
     EventsExecutor = None
 
-Self = TypeVar('Self', bound='Spinner')
-GRACE = 0.5
-"""Seconds that a callback has to end after a signal."""
 PATIENCE = 20.0
 """Seconds after a signal in which the middleware has to end, or the process ends without it."""
 FOREVER = 3600.0
@@ -41,7 +38,7 @@ callback and keeps a core busy.
 
 class Spinner:
     """
-    Runs an executor in a thread of its own while it is open.
+    Runs a node in a thread of its own while it is open, then destroys it and ends its context.
 
     The usual main (`rclpy.init`, ``executor.spin()``, except KeyboardInterrupt) hangs on SIGINT
     with the events executor of rclpy 7.1. So the executor spins in this thread until a future is
@@ -49,15 +46,14 @@ class Spinner:
     makes the executor look at the future.
 
     `on_end` is called in that thread when it ends, also by the `error` that a callback raised. At
-    the end a callback has `grace` seconds to end; None: as long as it takes.
+    the end a callback has `grace` seconds to end, or the node stays; None: as long as it takes.
     """
 
-    def __init__(
-        self, node: Node, on_end: Callable[[], None] = lambda: None, grace: float | None = GRACE
-    ) -> None:
+    grace: float | None = 0.5
+
+    def __init__(self, node: Node, on_end: Callable[[], None] = lambda: None) -> None:
         self.error: BaseException | None = None
-        self._on_end, self._grace = on_end, grace
-        self._logger = node.get_logger()
+        self.node, self._on_end = node, on_end
         # At 1 kHz the events executor takes a fifth of the CPU of the single-threaded one.
         kind = EventsExecutor or SingleThreadedExecutor
         self._executor = kind(context=node.context)
@@ -65,7 +61,7 @@ class Spinner:
         self._stop = Future()
         self._thread = threading.Thread(target=self._spin, name='executor', daemon=True)
 
-    def __enter__(self: Self) -> Self:
+    def __enter__(self) -> Any:
         # What there is now lives to the end, so garbage collections need not look at it. One that
         # does takes 70 ms, in which the middleware waits for Python and drops messages.
         gc.collect()
@@ -76,9 +72,11 @@ class Spinner:
     def __exit__(self, *_: object) -> None:
         self._stop.set_result(None)
         self._executor.wake()
-        self._thread.join(timeout=self._grace)
+        self._thread.join(timeout=self.grace)
         if not self.stuck:
             self._executor.shutdown()
+            self.node.destroy_node()
+            rclpy.try_shutdown(context=self.node.context)
 
     @property
     def stuck(self) -> bool:
@@ -94,12 +92,10 @@ class Spinner:
                     # The events executor of rclpy 7.1 still calls a service that was destroyed
                     # while its request waited, and then cannot send the answer. The
                     # single-threaded executor passes over such requests by itself.
-                    self._logger.warning(
+                    self.node.get_logger().warning(
                         'dropped a request to a service that was destroyed meanwhile',
                         throttle_duration_sec=5.0,
                     )
-        except ExternalShutdownException:
-            pass
         except BaseException as error:
             if not self._stop.done():
                 self.error = error
@@ -121,7 +117,6 @@ def run_node(name: str, factory: Callable[..., Node], argv: list[str] | None) ->
         print(help_of(name))
         return 0
     ended = stop_on_signals()
-    node = None
     origins: Origins = {}
     try:
         with ended.raising():
@@ -147,8 +142,6 @@ def run_node(name: str, factory: Callable[..., Node], argv: list[str] | None) ->
         print(f'{name}: error: {unknown}{" ".join(text.split())}', file=sys.stderr)
         return 2
     finally:
-        if node is not None:
-            node.destroy_node()
         rclpy.try_shutdown()
         faulthandler.cancel_dump_traceback_later()
     return 0

@@ -6,15 +6,9 @@ import os
 import re
 import shlex
 import signal
-import subprocess
-
-import pytest
-
-pytest.importorskip('rclpy', reason='no ROS 2 in this Python')
 
 import bag_files as files
-from commands import COMMAND, environment, interrupted, ROOT, run, start, wait_until
-from domains import take_domain
+from commands import COMMAND, environment, ROOT, run, start, take_domain, wait_until
 from fhaosmo_ros.nodes.middleware.messages import message_class
 from fhaosmo_ros.tools.bags.reader import BagReader
 from fhaosmo_ros.tools.bags.topics import read_ticks
@@ -22,16 +16,16 @@ from fhaosmo_ros.tools.demo import observers, OTHERS
 from fhaosmo_ros.topics import ESTIMATES, EVENT, PARAMETERS, SNAPSHOT
 from mcap.reader import NonSeekingReader
 import numpy as np
+import pytest
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import get_types_from_msg
-from running import Parameters, User
+from running import Parameters
 from std_srvs.srv import Trigger
 import yaml
 
-pytestmark = pytest.mark.ros
 APART = {'env': environment(ROS_DOMAIN_ID=str(take_domain()))}
 """For a domain without the plant that the other tests share."""
-NODES = ['--ros-args', '--params-file', str(ROOT / 'config' / 'demo.yaml')]
+FILE = ['--params-file', ROOT / 'config' / 'demo.yaml']
 
 
 def size(folder):
@@ -56,23 +50,19 @@ def wait_for_more(bag, length, process):
 
 
 @pytest.fixture(scope='module')
-def live():
+def live(launch):
     """A plant beside an estimator, as long as the tests of this file run."""
     # The estimator first: it then sees every sample that the plant publishes.
-    nodes = [start('estimator', *NODES), start('plant', *NODES)]
-    yield nodes
-    for node in nodes:
-        interrupted(node)
+    return launch('estimator', *FILE), launch('plant', *FILE)
 
 
-def test_bag_is_complete_after_ctrl_c(live, tmp_path):
+def test_bag_is_complete_after_ctrl_c(live, launch, tmp_path):
     bag = tmp_path / 'bag'
-    process = start('record', '-o', bag, '--all')
+    process = launch('record', '--', '-o', bag, '--all')
     # Some six seconds; the estimator may be discovered later than the plant.
     wait_for_more(bag, 1_200_000, process)
     wait_until(lambda: len(stamps(bag, '/estimator/stamp')) > 20, 'estimates', 90.0, process)
-    out, _ = interrupted(process)
-    counts = {}
+    out, counts = process.stop(), {}
     latched = ('/rosout', *(f'/estimator/{name}' for name in (EVENT, SNAPSHOT, PARAMETERS)))
     information = yaml.safe_load((bag / 'metadata.yaml').read_text())
     for topic in information['rosbag2_bagfile_information']['topics_with_message_count']:
@@ -93,23 +83,21 @@ def test_bag_is_complete_after_ctrl_c(live, tmp_path):
     assert read == counts
 
 
-def test_replay_follows_a_run_that_began_before_the_recording(live, tmp_path):
+def test_replay_follows_a_run_that_began_before_the_recording(live, user, launch, tmp_path):
     """Through live changes and a reset, from a state that only the node knows."""
     bag = tmp_path / 'bag'
-    process = start('record', '-o', bag)
+    process = launch('record', '--', '-o', bag)
     wait_for_more(bag, 800_000, process)
-    with User('hand') as hand:
-        parameters = Parameters(hand, '/estimator')
-        parameters.set(epsilon=0.05, gamma_rate=0.008, unknown_input_decay=0.5)
-        wait_for_more(bag, 100_000, process)  # half a second of messages to compare
-        assert hand.call('/estimator/reset', Trigger, Trigger.Request()).success
-        wait_for_more(bag, 100_000, process)
-        parameters.set(epsilon=0.3)
-        wait_for_more(bag, 200_000, process)
-        _, error = interrupted(process)
-        parameters.set(epsilon=40.0, gamma_rate=0.004, unknown_input_decay=0.0)
-    assert 'lost' not in error
-    command = ['replay', bag, '--params-file', ROOT / 'config' / 'demo.yaml']
+    parameters = Parameters(user, '/estimator')
+    parameters.set(epsilon=0.05, gamma_rate=0.008, unknown_input_decay=0.5)
+    wait_for_more(bag, 100_000, process)  # half a second of messages to compare
+    assert user.call('/estimator/reset', Trigger).success
+    wait_for_more(bag, 100_000, process)
+    parameters.set(epsilon=0.3)
+    wait_for_more(bag, 200_000, process)
+    assert 'lost' not in process.stop()
+    parameters.set(epsilon=40.0, gamma_rate=0.004, unknown_input_decay=0.0)
+    command = ['replay', bag, *FILE]
     result = run(*command, '-o', tmp_path / 'out')
     assert result.returncode == 0, result.stderr
     [(same, count)] = re.findall(r'; (\d+) of (\d+) snapshots are the same', result.stdout)
@@ -126,37 +114,29 @@ def test_replay_follows_a_run_that_began_before_the_recording(live, tmp_path):
     assert 'parameters differ' in fixed.stdout
 
 
-def test_input_that_was_remapped_and_channels_are_recorded(tmp_path):
+def test_input_that_was_remapped_and_channels_are_recorded(launch, tmp_path):
     bag = tmp_path / 'bag'
-    channels = ['--ros-args', '-p', 'channels:=[hip, knee]', '-r', 'hip/y:=/force']
-    processes = [
-        start('record', '-o', bag, '--names', '/estimator', **APART),
-        start('estimator', *channels, **APART),
-        start('plant', '--ros-args', '-r', '/y:=/force', **APART),
-    ]
-    try:
-        # It finds /force only as what the estimator listens to.
-        wait_for_more(bag, 700_000, processes[0])
-    finally:
-        for process in reversed(processes):
-            interrupted(process)
+    recorder = launch('record', '--', '-o', bag, '--names', '/rig/estimator')
+    launch('estimator', '-r', 'hip/y:=/force', namespace='/rig', channels=['hip', 'knee'])
+    launch('plant', '-r', 'y:=/force', namespace='/rig')
+    # It finds /force only as what the estimator listens to.
+    wait_for_more(bag, 700_000, recorder)
+    recorder.stop()
     with BagReader(bag) as reader:
         topics = {c.topic for c in reader.connections}
-    assert '/knee/y' not in topics  # nobody publishes it
-    chosen = ['-p', 'input_topic:=/force', '--follow', '/estimator/hip', '--name', '/replay/hip']
+    assert '/rig/knee/y' not in topics  # nobody publishes it
+    name = '/rig/estimator/hip'
+    chosen = ['-p', 'input_topic:=/force', '--follow', name, '--name', '/replay/hip']
     result = run('replay', bag, '-o', tmp_path / 'out', *chosen)
     assert result.returncode == 0, result.stderr
-    assert 'followed /estimator/hip' in result.stdout
+    assert f'followed {name}' in result.stdout
 
 
 def test_full_disk_leaves_what_was_recorded(live, tmp_path):
     """The system refuses to make a file larger than 150 kB."""
     command = ['record', '-o', str(tmp_path / 'bag'), '--topics', '/y']
     limited = f'ulimit -f 300; exec {" ".join(map(shlex.quote, [*COMMAND, *command]))}'
-    result = subprocess.run(
-        ['sh', '-c', limited], capture_output=True, text=True, timeout=120, env=environment(),
-        check=False,
-    )  # fmt: skip
+    result = run('-c', limited, command=['sh'])
     assert result.returncode == 2, result.stderr
     assert 'File "' not in result.stderr  # a stack, by Python or by the middleware
     assert '`mcap recover` saves what was recorded' in result.stderr
@@ -164,10 +144,10 @@ def test_full_disk_leaves_what_was_recorded(live, tmp_path):
     assert len(stamps(tmp_path / 'bag', '/y')) > 1500
 
 
-def test_bag_is_played_in_its_own_time_and_an_estimator_restarts_with_the_next(tmp_path):
+def test_bag_is_played_in_its_own_time_and_an_estimator_restarts_with_the_next(launch, tmp_path):
     """With names, remappings and the arguments that launch adds, also those without a meaning."""
     remapped = (
-        '--ros-args', '-r', '__ns:=/tools', '-r', '/y:=/rig/y', '--log-level', 'warn',
+        '-r', '__ns:=/tools', '-r', '/y:=/rig/y', '--log-level', 'warn',
         '-p', 'use_sim_time:=true', '--params-file', tmp_path / 'none.yaml',
     )  # fmt: skip
     (tmp_path / 'none.yaml').write_text('none: {ros__parameters: {}}')
@@ -175,25 +155,17 @@ def test_bag_is_played_in_its_own_time_and_an_estimator_restarts_with_the_next(t
     stamps, y = files.signal(1000)
     thing = '/x', 'planted_msgs/msg/Thing', int(stamps[-1]), files.float64(1.0)
     files.write(tmp_path / 'bag', [*files.floats(stamps, y), thing])
-    log, recorded = tmp_path / 'log', tmp_path / 'out' / 'out_0.mcap'
-    clock = ('--ros-args', '-p', 'use_sim_time:=true', '-p', 'sampling:=clock')
-    with log.open('w') as output:
-        processes = [
-            start('record', '-o', 'out', '--topics', '/y', *remapped, cwd=tmp_path),
-            start('estimator', *clock, '-p', 'input_topic:=/rig/y', stdout=output, stderr=output),
-        ]
-    try:
-        for _ in range(2):
-            play = start('play', 'bag', *remapped, cwd=tmp_path)
-            said = play.communicate(timeout=120)[0]
-            assert play.returncode == 0
-        wait_until(lambda: '1 restarts: stamps jumped' in log.read_text(), 'restart', 300.0)
-        wait_until(lambda: recorded.exists() and recorded.stat().st_size > 50_000, 'messages')
-    finally:
-        for process in processes:
-            interrupted(process)
-    assert 'not played: /x: planted_msgs/msg/Thing is not installed here' in said
-    assert 'playing 1 topics' in said
+    recorder = launch('record', *remapped, '--', '-o', tmp_path / 'out', '--topics', '/y')
+    clock = {'use_sim_time': True, 'sampling': 'clock'}
+    estimator = launch('estimator', namespace='/again', input_topic='/rig/y', **clock)
+    for _ in range(2):
+        played = run('play', tmp_path / 'bag', '--ros-args', *remapped)
+        assert played.returncode == 0
+    wait_until(lambda: '1 restarts: stamps jumped' in estimator.output(), 'restart', 300.0)
+    wait_until(lambda: size(tmp_path / 'out') > 50_000, 'messages')
+    recorder.stop()
+    assert 'not played: /x: planted_msgs/msg/Thing is not installed here' in played.stdout
+    assert 'playing 1 topics' in played.stdout
     with BagReader(tmp_path / 'out') as reader:
         times = [time for _, time, _, _ in reader.messages(['/rig/y'])]
     assert np.median(np.diff(times)) > 200_000  # 1 ms, less what play was held up

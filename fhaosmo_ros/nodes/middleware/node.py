@@ -1,17 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From the declarations of the core to ROS parameters: descriptors, overrides, live changes."""
+"""What every node is: its parameters, declared in the core, become those of ROS, also live."""
 
 from collections.abc import Callable, Iterable, Mapping
+from functools import partial
 from typing import Any
 
-from fhaosmo_ros.core.parameters.declaration import Parameter, Parameters, shown, suggestion, Value
+from fhaosmo_ros.core.parameters.declaration import Parameter, Parameters, shown, suggestion
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
-from fhaosmo_ros.core.parameters.files import BUILT_IN, is_built_in
+from fhaosmo_ros.core.parameters.files import BUILT_IN, complete, is_built_in
 from fhaosmo_ros.core.parameters.per_channel import followers
+from fhaosmo_ros.core.parameters.tables import NODE_TABLES
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.exceptions import ParameterNotDeclaredException
 from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
+from rosgraph_msgs.msg import Clock
 
 
 class RefusedError(ParameterNotDeclaredException):
@@ -23,11 +26,6 @@ class RefusedError(ParameterNotDeclaredException):
 
     def __init__(self, reason: str) -> None:
         Exception.__init__(self, reason)
-
-
-def type_of(parameter: Parameter) -> RosParameter.Type:
-    """Return the ROS type of a declared parameter."""
-    return RosParameter.Type[{'int': 'INTEGER'}.get(parameter.kind, parameter.kind.upper())]
 
 
 def descriptor(parameter: Parameter, read_only: bool) -> ParameterDescriptor:
@@ -45,7 +43,7 @@ def descriptor(parameter: Parameter, read_only: bool) -> ParameterDescriptor:
     )
     result = ParameterDescriptor(
         name=parameter.name,
-        type=type_of(parameter).value,
+        type=RosParameter.Type.from_parameter_value(parameter.default).value,
         description=parameter.text,
         additional_constraints='; '.join(filter(None, constraints)),
         read_only=read_only,
@@ -71,48 +69,64 @@ def built_in(given: Mapping[str, Any]) -> list[RosParameter]:
     return [RosParameter(name, value=value) for name, value in own.items()]
 
 
-class NodeParameters:
+class BaseNode(Node):
     """
-    The parameters of a node: declared in ROS, and changed by its services.
+    A node whose parameters are declared in ROS, and changed by its services.
 
-    ROS has a copy of the values for its services; the node reads these ones. A live change is
-    coerced, prepared and perhaps refused as a set before ROS takes it (pre-set callback), and
-    adopted afterwards (post-set callback).
+    ROS has a copy of the values for its services; the node reads its own `values`. A live change
+    is coerced, prepared and perhaps refused as a set before ROS takes it (pre-set callback), and
+    adopted afterwards (post-set callback). A subclass has the methods for it: `_prepare` gets all
+    values as they would be, and the changes; it returns what `_adopt` gets once ROS has accepted
+    them, or raises ConfigurationError, and changes nothing.
 
-    `values` are the present ones. `prepare` gets all values as they would be, and the changes; it
-    returns what `adopt` gets once ROS has accepted them, or raises ConfigurationError, and changes
-    nothing. `fixed` parameters can't change in any state of the node; without it, those that are
-    not live.
+    `given` is all that files and the command line set, also rclpy's own, such as use_sim_time;
+    what can't be used raises ConfigurationError. `fixed` parameters can't change in any state of
+    the node; without it, those that are not live.
     """
 
     def __init__(
-        self,
-        node: Node,
-        values: Parameters,
-        prepare: Callable[[Parameters, Mapping[str, Value]], Any],
-        adopt: Callable[[Any], None],
-        fixed: Iterable[str] | None = None,
+        self, name: str, given: Mapping[str, Any], fixed: Iterable[str] | None = None
     ) -> None:
-        self._node, self._prepare, self._adopt_change = node, prepare, adopt
-        not_live = (name for name, parameter in values.table.items() if not parameter.live)
+        values = complete(given, NODE_TABLES[name])
+        super().__init__(name, parameter_overrides=built_in(given), enable_logger_service=True)
+        self.given = given
+        not_live = (p.name for p in values.table.values() if not p.live)
         self._read_only = set(not_live if fixed is None else fixed)
         self.extend(values)
-        node.add_pre_set_parameters_callback(self._look_at)
-        node.add_post_set_parameters_callback(self._adopt)
+        self.add_pre_set_parameters_callback(self._look_at)
+        self.add_post_set_parameters_callback(self._take_over)
+
+    def create_subscription(
+        self, msg_type: Any, topic: str, callback: Any, *arguments: Any, **options: Any
+    ) -> Any:
+        """Return a subscription; that of /clock, which rclpy makes, passes over negative times."""
+        if msg_type is Clock:
+            callback = partial(self._take_time, callback)
+        return super().create_subscription(msg_type, topic, callback, *arguments, **options)
+
+    def _take_time(self, take: Callable[[Clock], None], message: Clock) -> None:
+        """Take a time that is not negative: in rclpy 7.1 such a one ends the node."""
+        if message.clock.sec >= 0:
+            take(message)
+            return
+        self.get_logger().warning(
+            f'rejected a time on /clock: expected seconds >= 0, got {message.clock.sec}',
+            throttle_duration_sec=5.0,
+        )
 
     def extend(self, values: Parameters) -> None:
         """Go on with values, perhaps of a larger table: what is new is declared."""
         for name, value in values.items():
-            if not self._node.has_parameter(name):
+            if not self.has_parameter(name):
                 declared = descriptor(values.table[name], name in self._read_only)
-                self._node.declare_parameter(name, value, declared, ignore_override=True)
+                self.declare_parameter(name, value, declared, ignore_override=True)
         self.values = values
 
     def _look_at(self, parameters: list[RosParameter]) -> list[RosParameter]:
         """Coerce and prepare a set; return it, and those that follow, in the declared types."""
         table, found = self.values.table, {p.name: p for p in parameters}
         for name in found:
-            if not self._node.has_parameter(name):  # rclpy 7.1 refuses it too, without the name
+            if not self.has_parameter(name):  # rclpy 7.1 refuses it too, without the name
                 raise ParameterNotDeclaredException(f"'{name}'{suggestion(name, table)}")
         ours = [name for name in found if name in table]
         if not ours or self._read_only & found.keys():  # which rclpy refuses
@@ -125,16 +139,14 @@ class NodeParameters:
             values = Parameters(table, {**self.values, **changes})
             self._next = values, changes, self._prepare(values, changes)
         except ConfigurationError as error:
-            self._node.get_logger().warning(f'rejected: {error}')
+            self.get_logger().warning(f'rejected: {error}')
             raise RefusedError(str(error)) from None
-        coerced = {
-            name: RosParameter(name, type_of(table[name]), v) for name, v in changes.items()
-        }
+        coerced = {name: RosParameter(name, value=value) for name, value in changes.items()}
         return list({**found, **coerced}.values())
 
-    def _adopt(self, parameters: list[RosParameter]) -> None:
+    def _take_over(self, parameters: list[RosParameter]) -> None:
         if any(p.name in self.values.table for p in parameters):
             self.values, changes, prepared = self._next
-            self._adopt_change(prepared)
+            self._adopt(prepared)
             text = ', '.join(f'{name} = {value}' for name, value in changes.items())
-            self._node.get_logger().info(f'set {text}')
+            self.get_logger().info(f'set {text}')
