@@ -143,7 +143,7 @@ def test_compiled_code_takes_no_arrays_of_other_sizes():
     for call, *arguments in (
         (policy.run, STAMPS[:2], Y, none), (policy.run, STAMPS, Y, np.zeros((200, 2))),
         (Plant()._system.advance, Y, Y), (Clock().interval, 1e-3, three, three[:2], three),
-        (smoother._passes.forward, smoother._rows, -1), (LinearModel, np.eye(18), 1.0),
+        (smoother._passes.forward, three), (LinearModel, np.eye(18), 1.0),
         *((phi.Expressions, [[(int(code), 1)]], 1, 1) for code in (phi.ADD, phi.STATE)),
     ):  # fmt: skip
         with pytest.raises(ValueError, match=r'expected|arrays'):

@@ -148,16 +148,13 @@ cdef class LinearModel:
     def transition(self, double h):
         """Return exp(A h) and Q over `h`, (N, N) each."""
         cdef Row f[MOST_LEVELS]
-        cdef Row whole[MOST_LEVELS]
         cdef Row q[MOST_LEVELS]
-        cdef int _, count = sub_steps(h, self.fastest), n = self.n
+        cdef int count = sub_steps(h, self.fastest), n = self.n
         memset(q, 0, sizeof(q))
         self.predict(q, h)
         self.flow(h / count, f)
-        memcpy(whole, f, sizeof(f))
-        for _ in range(count - 1):
-            multiply(n, f, whole)
-        return np.array(whole)[:n, :n].copy(), np.array(q)[:n, :n].copy()
+        part = np.array(f)[:n, :n].copy()
+        return np.linalg.matrix_power(part, count), np.array(q)[:n, :n].copy()
 
 
 def matern(rate, derivatives):

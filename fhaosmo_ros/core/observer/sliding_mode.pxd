@@ -51,6 +51,7 @@ cdef class SlidingMode(Structure):
 
 
 cdef double doubt_of_noise(double age, double speed) noexcept nogil
+cdef double spread_after(double spread, double b, double expected) noexcept nogil
 cdef double follow_spread(Memory* memory, double b, double expected, double late) noexcept nogil
 
 

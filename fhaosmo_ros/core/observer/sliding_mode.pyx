@@ -31,19 +31,26 @@ cdef double MEDIAN = 0.6745
 cdef double SPREAD_RATE = 0.005
 
 
+cdef double spread_after(double spread, double b, double expected) noexcept nogil:
+    """
+    Return the size of innovations over that expected, after one more (D 21).
+
+    It goes up by a small part of it where |b| is above its median if it were normal, and down by
+    as much where |b| is below. So the size of b does not matter, and outliers hardly do.
+    """
+    if fabs(b) > MEDIAN * spread * expected:
+        return spread * (1.0 + SPREAD_RATE)
+    return max(spread / (1.0 + SPREAD_RATE), 1.0)
+
+
 cdef double follow_spread(Memory* memory, double b, double expected, double late) noexcept nogil:
     """
     Return the size that innovations have: the expected one times the spread, which follows (D 21).
 
-    The spread goes up by a small part of it where |b| is above its median if it were normal, and
-    down by as much where |b| is below. So its size does not matter, and outliers hardly do. A
-    sample that is too far off is counted in `Memory.beyond`; a late stamp puts it off by `late`.
+    A sample that is too far off is counted in `Memory.beyond`; a late stamp puts it off by `late`.
     """
     cdef double usual
-    if fabs(b) > MEDIAN * memory.spread * expected:
-        memory.spread *= 1.0 + SPREAD_RATE
-    else:
-        memory.spread = max(memory.spread / (1.0 + SPREAD_RATE), 1.0)
+    memory.spread = spread_after(memory.spread, b, expected)
     usual = memory.spread * expected
     if fabs(b) > GATE * usual + late:
         memory.beyond += 1.0

@@ -6,7 +6,7 @@ from typing import Any
 from fhaosmo_ros.core.model.inputs import known_inputs
 from fhaosmo_ros.core.observer.configuration import DERIVATIVES, Floats
 from fhaosmo_ros.core.observer.estimates import Estimate, Trajectory, TUNING
-from fhaosmo_ros.core.observer.smoothing import Kind, MODEL, Passes, POINT
+from fhaosmo_ros.core.observer.smoothing import Kind, Passes, POINT
 from fhaosmo_ros.core.observer.status import AFRESH, JUMPED, LEVEL_SHIFT, REJECTED, UNUSED
 from fhaosmo_ros.core.observer.structure import Record
 import numpy as np
@@ -105,18 +105,18 @@ class Smoother:
         for begin in range(0, len(kept), BLOCK):
             block = slice(begin, begin + BLOCK)
             self._append(found.rows(block), times[block], u[block], kinds[block])
-            early = self._lag is None and self._passes.tunes and self._count <= BEGINNING
-            if (self._passed or not early) and self._forward():
+            if self._forward():
                 smoothed.append(self._back())
         return self._handed_out(np.concatenate(smoothed))
 
     def finish(self) -> Trajectory:
         """Return the rows that still wait: nothing comes after them."""
-        if self._count and self._forward():
+        if self._count and self._forward(ends=True):
             smoothed = self._back(ends=True)
         else:  # the observer knows nothing but y
             smoothed = self._rows['own'][: self._count, :, : self._observer.levels].copy()
             self._done = self._passed = self._count = 0
+            self._expected[Kind.BEGINS] = True
         return self._handed_out(smoothed)
 
     def _kinds(self, status: Ints) -> Ints:
@@ -145,54 +145,56 @@ class Smoother:
         self._count = first + more
         rows, n = self._rows[first : self._count], c.levels
         h = np.diff(times, prepend=times[0] if self._time is None else self._time)
-        rows['h'], self._time = h * 1e-9 if h.dtype.kind == 'i' else h, times[-1]
-        rows['time'], rows['kind'], rows['u'][:, : u.shape[1]] = times, kinds, u
+        h, self._time = np.maximum(h * 1e-9 if h.dtype.kind == 'i' else h, 0.0), times[-1]
+        rows['h'], rows['time'], rows['kind'], rows['u'][:, : u.shape[1]] = h, times, kinds, u
         rows['y'] = found.z_hat[:, 0] + found.innovation[:, 0]  # less its offset (D 23)
         own, deviations = rows['own'], found.standard_deviation
         own[:, 0, :n], own[:, 1] = found.z_hat, np.inf
         if c.internal:
             own[:, 0, 1:n] = found.z_tilde[:, :-1]
         own[:, 1, : deviations.shape[1]] = deviations**2
-        models = found.model.T if c.self_tuning else self._passes.model
-        for name, values in zip(MODEL, models, strict=True):
-            rows[name] = values
+        if c.self_tuning:
+            own[:, 0, n - DERIVATIVES : n] = 0.0  # those of d are not relied on
+            rows['model'] = found.model.view(POINT['model'])[:, 0]
+        else:
+            rows['model'] = self._passes.model
 
-    def _forward(self) -> bool:
-        """Go forward through the rows that wait for it, unless no model of d is known yet."""
-        rows, new = self._rows[: self._count], self._passed
+    def _forward(self, ends: bool = False) -> bool:
+        """Go forward through the rows that wait for it, unless the model of d is not known yet."""
+        rows = self._rows[max(self._passed - 1, 0) : self._count]
         if self._passes.tunes:
-            if not new and not rows['intensity'].any():
+            early = self._lag is None and len(rows) <= BEGINNING and not ends
+            if not self._passed and (early or not rows['model']['drive'].any()):
                 return False
-            self._complete(new)
-        self._passes.forward(rows, new)
+            self._complete(rows)
+        self._passes.forward(rows)
         self._passed = self._count
         return True
 
-    def _complete(self, new: int) -> None:
+    def _complete(self, rows: NDArray[Any]) -> None:
         """Let what a self-tuning observer knows stand for what it did not know before (D 34)."""
-        rows = self._rows[max(new - 1, 0) : self._count]
-        own, numbers, known = rows['own'], np.arange(len(rows)), rows['intensity'] > 0.0
+        own, model, numbers = rows['own'], rows['model'], np.arange(len(rows))
+        known = model['drive'] > 0.0
         latest = np.maximum.accumulate(np.where(known, numbers, 0))
-        if not new:
+        if not self._passed:
             first = int(np.argmax(known))
             own[:first, :, 1:] = own[first, :, 1:]
             stands = first if self._lag is not None else max(first, min(BEGINNING, numbers[-1]))
             latest[:stands] = latest[stands]
-        own[:, 0, self._observer.levels - DERIVATIVES :] = 0.0  # those of d are not relied on
-        for name in MODEL:
-            rows[name] = rows[name][latest]
+        model[:] = model[latest]
         # d has not jumped at each of them.
-        rows['derivatives'][latest != numbers] %= DERIVATIVES + 1
+        model['derivatives'][latest != numbers] %= DERIVATIVES + 1
 
     def _back(self, ends: bool = False) -> Floats:
         """Return the estimates that are due now, or all that wait where the recording ends."""
-        rows, end, lag = self._rows[: self._count], self._count, None if ends else self._lag
+        rows = self._rows[self._done : self._count]
+        end, lag = len(rows), None if ends else self._lag
         if lag is None and not ends:
-            end = self._done
-            if len(rows) - end >= self._wait:
-                end = self._passes.settled(rows, end)
+            end = 0
+            if len(rows) >= self._wait:
+                end = self._passes.settled(rows)
                 self._wait = len(rows) - end + BLOCK
-        found = self._passes.back(rows, self._done, end, lag)
+        found = self._passes.back(rows, end, lag)
         self._done += len(found)
         return found  # type: ignore[no-any-return]
 

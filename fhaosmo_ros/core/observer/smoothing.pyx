@@ -15,13 +15,14 @@ from libc.string cimport memcpy, memset
 
 from fhaosmo_ros.core.model.prediction cimport MOST_LEVELS, Prediction
 from fhaosmo_ros.core.observer.kalman cimport (
-    LinearModel, Row, add_drive, carry, correct, multiply, sub_steps
+    Row, add_drive, carry, correct, multiply, sub_steps
 )
 from fhaosmo_ros.core.observer.self_tuning.members cimport by_binomials, ORDERS
-from fhaosmo_ros.core.observer.sliding_mode cimport HUBER, follow_spread
-from fhaosmo_ros.core.observer.structure cimport MOST_INPUTS, Memory
+from fhaosmo_ros.core.observer.self_tuning.weights cimport Model
+from fhaosmo_ros.core.observer.sliding_mode cimport HUBER, spread_after
+from fhaosmo_ros.core.observer.structure cimport MOST_INPUTS
 
-from fhaosmo_ros.core.observer.kalman import STATES_DOUBT, Uncertainty
+from fhaosmo_ros.core.observer.kalman import LinearModel, STATES_DOUBT, Uncertainty
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 import numpy as np
 
@@ -53,10 +54,7 @@ cdef struct Point:
     int last  # the level that white noise drives; found by going forward
     double u[MOST_INPUTS]  # known inputs since the row before
     Row own[2]  # the observer's estimates; if it tunes itself, their variances
-    double variance  # of the noise on y
-    double intensity  # of the white noise that drives the last level of d
-    double decay  # kappa of D 26 (1/s), with d and its derivatives as there; 0: as in phi
-    double derivatives  # k of the model of d; k - 4: d has jumped since the row before (D 33)
+    Model model  # with fixed gains kappa is 0, as phi has it
     # What going forward finds.
     double spread  # size of the innovations over that expected, at least 1 (D 21)
     double pull  # e / S; this and the next two are 0 without a sample
@@ -68,7 +66,6 @@ cdef struct Point:
 
 cdef Point example
 POINT = np.asarray(<Point[:1]> &example).dtype
-MODEL = ['variance', 'intensity', 'decay', 'derivatives']
 
 
 cdef class Passes:
@@ -87,27 +84,27 @@ cdef class Passes:
     """
 
     cdef readonly object configuration
-    cdef readonly object model  # `MODEL` of each row, with fixed gains
+    cdef readonly object model  # of each row, with fixed gains
     cdef readonly bint tunes  # a self-tuning observer: the model of d is another one in each row
     cdef Prediction prediction
     cdef int n, order  # levels; states of the model
     cdef bint from_measurement  # z_1 begins at the first sample
-    cdef LinearModel linear  # at rest
+    cdef double fastest  # rate of the fastest motion at rest (1/s)
     cdef double[::1] first  # estimates of a fresh observer
     cdef double[::1] state_sizes
     cdef double[:, ::1] fresh  # P of a fresh observer with fixed gains
-    cdef Memory memory  # a row's own: the size of the innovations (D 21), nothing else
 
     def __cinit__(self, configuration):
         p, model = configuration.parameters, configuration.model
         self.n, self.order = configuration.levels, model.order
         self.tunes = configuration.self_tuning
         if self.tunes:
-            self.linear = LinearModel(model.slopes_at_rest + np.eye(self.order, k=1), 0.0)
+            self.fastest = LinearModel(model.slopes_at_rest + np.eye(self.order, k=1), 0.0).fastest
         elif p['noise_size'] > 0.0 and p['unknown_input']:
             its = Uncertainty(model, p, configuration.state_sizes)
-            self.linear, self.fresh = its.linear, its.fresh
-            self.model = its.variance, its.intensity, 0.0, self.n - 1 - self.order
+            self.fastest, self.fresh = its.linear.fastest, its.fresh
+            its_model = its.variance, its.intensity, 0.0, self.n - 1 - self.order
+            self.model = np.array(its_model, POINT['model'])
         else:
             raise ConfigurationError(
                 "smoothing: expected 'noise_size' > 0 (standard deviation of the noise on y; "
@@ -124,35 +121,30 @@ cdef class Passes:
 
     # Forward
 
-    def forward(self, rows, Py_ssize_t begin):
-        """Go forward through the rows from `begin` on (D 24)."""
-        cdef Point* point = points(rows, begin, len(rows))
+    def forward(self, Point[::1] rows):
+        """Go forward through rows (D 24); the first one either begins, or was the last before."""
+        cdef Point* now
         cdef Py_ssize_t k
-        for k in range(begin, len(rows)):
-            self.take(point + k - 1 if k > 0 else NULL, point + k)
+        for k in range(rows.shape[0]):
+            now = &rows[k]
+            now.last = self.order + (<int>now.model.derivatives & (ORDERS - 1))
+            if now.kind == BEGINS:
+                self.begin(now, &self.first[0])
+                now.spread = 1.0
+                if self.from_measurement:
+                    now.x[0] = now.y
+            elif k > 0:
+                self.take(&rows[k - 1], now)
 
     cdef void take(self, const Point* before, Point* now) noexcept nogil:
-        """Go forward to a row from the one before it, if there is one."""
+        """Go forward to a row from the one before it."""
         cdef int i
-        now.last = self.order + (<int>now.derivatives & (ORDERS - 1))
-        now.pull = now.certainty = 0.0
-        now.spread = 1.0
-        if before == NULL or now.kind == BEGINS:
-            now.kind = BEGINS
-            self.begin(now, &self.first[0])
-            if self.from_measurement:
-                now.x[0] = now.y
-            return
         now.spread = before.spread
-        if not now.h > 0.0:  # no time has passed
-            now.h, now.time = 0.0, before.time
-            if now.kind == MEASURED:
-                now.kind = UNMEASURED
         self.predict(before, now)
         if now.kind == JUMPS:  # nothing before it matters to z_1, which is y (D 23)
             for i in range(self.n):
                 now.f[0][i] = now.p[0][i] = now.p[i][0] = 0.0
-            now.p[0][0], now.x[0] = now.variance, now.y
+            now.p[0][0], now.x[0] = now.model.noise, now.y
         elif now.kind == MEASURED:
             self.measure(now)
 
@@ -167,7 +159,7 @@ cdef class Passes:
             for i in range(self.n):
                 memcpy(now.p[i], &self.fresh[i, 0], self.n * sizeof(double))
             return
-        now.p[0][0] = now.variance
+        now.p[0][0] = now.model.noise
         for i in range(1, d):
             size = DOUBT * max(self.state_sizes[i], fabs(now.own[0][i]))
             now.p[i][i] = size * size
@@ -180,22 +172,23 @@ cdef class Passes:
     cdef void predict(self, const Point* before, Point* now) noexcept nogil:
         """Predict a row from the one before (D 24); if that can't be, begin at the observer's."""
         cdef Row slope[MOST_LEVELS]
-        cdef int i, j, n = self.n, count = sub_steps(now.h, max(self.linear.fastest, now.decay))
+        cdef int i, j, n = self.n, count
         cdef bint finite
+        count = sub_steps(now.h, max(self.fastest, now.model.loss))
         memcpy(now.p, before.p, sizeof(now.p))
         memset(now.f, 0, sizeof(now.f))
         for i in range(n):
             now.x[i], now.f[i][i] = before.x[i] + now.p[i][0] * before.pull, 1.0
         if before.certainty > 0.0:
             correct(n, now.p, before.noise)
-        if now.decay != before.decay or now.last != before.last:
+        if now.model.loss != before.model.loss or now.last != before.last:
             self.change_model(before, now)
         for _ in range(count):
             self.step(now, now.h / count, slope)
             multiply(n, slope, now.f)
             carry(n, slope, now.p)
-            add_drive(now.last, now.intensity, now.h / count, now.p)
-        finite = now.p[0][0] + now.variance > 0.0
+            add_drive(now.last, now.model.drive, now.h / count, now.p)
+        finite = now.p[0][0] + now.model.noise > 0.0
         for i in range(n):
             for j in range(i):
                 now.p[i][j] = now.p[j][i] = 0.5 * (now.p[i][j] + now.p[j][i])
@@ -208,7 +201,7 @@ cdef class Passes:
         """Go on by `h` with x of a row; write the exact derivative of the Runge-Kutta steps."""
         cdef double* z = self.prediction.z
         cdef double* dz = self.prediction.dz
-        cdef double kappa = now.decay
+        cdef double kappa = now.model.loss
         cdef int i, j, n = self.n, d = self.order
         for j in range(n):
             for i in range(n):
@@ -236,7 +229,7 @@ cdef class Passes:
         surer of an estimate than the observer is now, it was wrong.
         """
         cdef int i, j, d = self.order
-        cdef double more = now.decay - before.decay
+        cdef double more = now.model.loss - before.model.loss
         by_binomials(now.x + d, ORDERS, more)
         for i in range(d + 1, self.n):  # row by row: (D + kappa)^j = (D + kappa)^(j-1) (D + kappa)
             for j in range(d, i + 1):
@@ -254,12 +247,11 @@ cdef class Passes:
     cdef void measure(self, Point* now) noexcept nogil:
         """Weigh the sample of a row (D 24); after a jump of d it says of what size (D 34)."""
         cdef int i, j, d = self.order
-        cdef double s = now.p[0][0] + now.variance, e = now.y - now.x[0], share
+        cdef double s = now.p[0][0] + now.model.noise, e = now.y - now.x[0], share
         cdef double factor
-        self.memory.spread = now.spread
-        factor = max(fabs(e) / (HUBER * follow_spread(&self.memory, e, sqrt(s), 0.0)), 1.0)
-        now.spread = self.memory.spread
-        if now.derivatives < 0.0 and factor > 1.0:
+        now.spread = spread_after(now.spread, e, sqrt(s))
+        factor = max(fabs(e) / (HUBER * now.spread * sqrt(s)), 1.0)
+        if now.model.derivatives < 0.0 and factor > 1.0:
             for i in range(self.n):
                 share = (e * e - s) * now.f[i][d] / (now.f[0][d] * now.f[0][d])
                 for j in range(self.n):
@@ -267,14 +259,14 @@ cdef class Passes:
                 if 0 < i <= d:  # when it has jumped is not known
                     now.p[i][i] += share * now.f[i][d]
             factor = 1.0
-        now.noise = now.variance * factor
+        now.noise = now.model.noise * factor
         now.certainty = 1.0 / (now.p[0][0] + now.noise)
         now.pull = e * now.certainty
 
     # Back
 
     cdef void go_back(
-        self, const Point* rows, Py_ssize_t last, Py_ssize_t begin, Py_ssize_t end, double doubt,
+        self, Point[::1] rows, Py_ssize_t last, Py_ssize_t begin, Py_ssize_t end, double doubt,
         double[:, :, ::1] out
     ) noexcept nogil:
         """
@@ -287,7 +279,7 @@ cdef class Passes:
         cdef double behind[MOST_LEVELS]
         cdef Row known[MOST_LEVELS]  # X of D 34
         cdef Row a[MOST_LEVELS]  # of X <- A X A'
-        cdef const Point* now = rows + last
+        cdef const Point* now = &rows[last]
         cdef double total
         cdef Py_ssize_t k
         cdef int i, j, n = self.n
@@ -297,7 +289,7 @@ cdef class Passes:
             a[i][i] = 1.0
             costate[i] = doubt / sqrt(now.p[i][i]) if now.p[i][i] > 0.0 else 0.0
         for k in range(last, begin - 1, -1):
-            now = rows + k
+            now = &rows[k]
             total = 0.0 if doubt > 0.0 else now.pull
             for i in range(n):
                 total += now.certainty * now.p[0][i] * costate[i]
@@ -311,7 +303,7 @@ cdef class Passes:
                 carry(n, a, known)
                 known[0][0] += now.certainty
             if k < end:
-                self.write(now, costate, known, &out[k - begin, 0, 0])
+                self.write(now, costate, known, &out[k, 0, 0])
             memcpy(behind, costate, n * sizeof(double))
             total = 0.0
             for i in range(n if self.tunes else 0):
@@ -342,9 +334,9 @@ cdef class Passes:
             for i in range(n):
                 out[n + i] = max(now.p[i][i] - less[i][i], ROUNDING * fabs(now.p[i][i]))
 
-    def back(self, rows, Py_ssize_t begin, Py_ssize_t end, lag=None):
+    def back(self, rows, Py_ssize_t end, lag=None):
         """
-        Return the estimates of the rows from `begin` to `end` that are due, by all that is known.
+        Return the estimates of rows, of the first `end` at most, that are due by what is known.
 
         With a lag (ns) these are the ones that are so old, by what was known when they became so
         old; a row that begins makes all before it due, which will not be known better. Where
@@ -356,51 +348,38 @@ cdef class Passes:
             With the variances of their errors, for a self-tuning observer.
 
         """
-        cdef const Point* point = points(rows, begin, end)
-        cdef Py_ssize_t due = begin, done = begin, count = len(rows), k
+        cdef Point[::1] point = rows
+        cdef Py_ssize_t due = 0, done = 0, count = point.shape[0], k
         cdef bint whole = lag is None
         cdef long long age = 0 if whole else lag
-        cdef double[:, :, ::1] out = np.empty((end - begin, 1 + self.tunes, self.n))
-        for k in range(count - 1 if whole else begin, count):
+        cdef double[:, :, ::1] out = np.empty((end, 1 + self.tunes, self.n))
+        for k in range(count - 1 if whole else 0, count):
             while due < min(end, k + 1) and (
                 whole or point[k].time - point[due].time >= age
                 or (point[k].kind >= BEGINS and due < k)
             ):
                 due += 1
             if due > done:
-                self.go_back(point, k, done, due, 0.0, out[done - begin:])
+                self.go_back(point, k, done, due, 0.0, out)
                 done = due
-        found = np.asarray(out)[:due - begin]
-        bad = ~np.isfinite(found).all(axis=(1, 2))
-        found[bad] = rows['own'][begin:due, :1 + self.tunes, :self.n][bad]
-        return found
+        found, own = np.asarray(out)[:due], rows['own'][:due, :1 + self.tunes, :self.n]
+        return np.where(np.isfinite(found).all(axis=(1, 2), keepdims=True), found, own)
 
-    def settled(self, rows, Py_ssize_t begin):
-        """Return up to which row from `begin` on samples to come change `TOLERANCE` at most."""
+    def settled(self, rows):
+        """Return how many of the first rows samples to come change by `TOLERANCE` at most."""
         cdef Py_ssize_t count = len(rows)
-        cdef const Point* point = points(rows, begin, count)
-        cdef double[:, :, ::1] out = np.empty((count - begin, 1 + self.tunes, self.n))
-        self.go_back(point, count - 1, begin, count, 1.0, out)
-        waiting = rows[begin:]
-        x, p = waiting['x'][:, :self.n], waiting['p'].diagonal(0, 1, 2)[:, :self.n]
+        cdef double[:, :, ::1] out = np.empty((count, 1 + self.tunes, self.n))
+        self.go_back(rows, count - 1, 0, count, 1.0, out)
+        x, p = rows['x'][:, :self.n], rows['p'].diagonal(0, 1, 2)[:, :self.n]
         change, allowed = np.abs(np.asarray(out)[:, 0] - x), TOLERANCE * np.sqrt(np.abs(p))
         is_open = (change > allowed + ROUNDING * np.abs(x)).any(axis=1)
-        return begin + np.argmax(np.append(is_open, True))
-
-
-cdef Point* points(rows, Py_ssize_t begin, Py_ssize_t end) except NULL:
-    """Return where rows lie; raise ValueError where those from `begin` to `end` are none."""
-    cdef unsigned char[::1] numbers
-    if rows.dtype != POINT or rows.ndim != 1 or not 0 <= begin <= end <= len(rows) > 0:
-        raise ValueError(f'smoothing: expected rows, and some from {begin} to {end} of them')
-    numbers = rows.view(np.uint8)
-    return <Point*>&numbers[0]
+        return np.argmax(np.append(is_open, True))
 
 
 cdef double usual(const Point* now, int i, int j) noexcept nogil:
     """Return the covariance of the levels i and j before the last one, as ever in D 26."""
-    cdef double share = now.intensity
+    cdef double share = now.model.drive
     cdef int m
     for m in range(1, i + 1):  # (i + j)! / (i! j!)
         share *= (j + m) / <double>m
-    return share / pow(2.0 * now.decay, i + j + 1)
+    return share / pow(2.0 * now.model.loss, i + j + 1)
