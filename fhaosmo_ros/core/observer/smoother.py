@@ -78,6 +78,8 @@ class Smoother:
     def configure(self) -> None:
         """Go on with the observer's present parameters; raise as the constructor."""
         self._passes = Passes(self._observer.configuration)
+        # What is due where nothing is.
+        self._nothing = np.zeros((0, 1 + self._passes.tunes, self._observer.levels))
 
     def cut(self) -> None:
         """Let the next row begin: it has nothing to do with those before it, which are due."""
@@ -101,22 +103,19 @@ class Smoother:
         found, times, u = found.rows(kept), times[kept], u[kept]
         more = zip(self._waiting, [*found, numbers], strict=True)
         self._waiting = [np.concatenate(pair) for pair in more]
-        smoothed = [np.zeros((0, 1 + self._passes.tunes, self._observer.levels))]
+        smoothed = [self._nothing]
         for begin in range(0, len(kept), BLOCK):
             block = slice(begin, begin + BLOCK)
             self._append(found.rows(block), times[block], u[block], kinds[block])
-            if self._forward():
-                smoothed.append(self._back())
+            smoothed.append(self._smoothed())
         return self._handed_out(np.concatenate(smoothed))
 
     def finish(self) -> Trajectory:
         """Return the rows that still wait: nothing comes after them."""
-        if self._count and self._forward(ends=True):
-            smoothed = self._back(ends=True)
-        else:  # the observer knows nothing but y
+        smoothed = self._smoothed(ends=True)
+        if not self._passed:  # the observer knows nothing but y
             smoothed = self._rows['own'][: self._count, :, : self._observer.levels].copy()
-            self._done = self._passed = self._count = 0
-            self._expected[Kind.BEGINS] = True
+            self._count, self._expected[Kind.BEGINS] = 0, True
         return self._handed_out(smoothed)
 
     def _kinds(self, status: Ints) -> Ints:
@@ -159,17 +158,25 @@ class Smoother:
         else:
             rows['model'] = self._passes.model
 
-    def _forward(self, ends: bool = False) -> bool:
-        """Go forward through the rows that wait for it, unless the model of d is not known yet."""
-        rows = self._rows[max(self._passed - 1, 0) : self._count]
+    def _smoothed(self, ends: bool = False) -> Floats:
+        """Return the estimates that are due now, or all that wait where the recording ends."""
+        rows, lag = self._rows[max(self._passed - 1, 0) : self._count], self._lag
         if self._passes.tunes:
-            early = self._lag is None and len(rows) <= BEGINNING and not ends
+            early = lag is None and len(rows) <= BEGINNING and not ends
             if not self._passed and (early or not rows['model']['drive'].any()):
-                return False
+                return self._nothing
             self._complete(rows)
         self._passes.forward(rows)
-        self._passed = self._count
-        return True
+        self._passed, rows = self._count, self._rows[self._done : self._count]
+        end = len(rows)
+        if lag is None and not ends:
+            end = 0
+            if len(rows) >= self._wait:
+                end = self._passes.settled(rows)
+                self._wait = len(rows) - end + BLOCK
+        found: Floats = self._passes.back(rows, end, None if ends else lag)
+        self._done += len(found)
+        return found
 
     def _complete(self, rows: NDArray[Any]) -> None:
         """Let what a self-tuning observer knows stand for what it did not know before (D 34)."""
@@ -184,19 +191,6 @@ class Smoother:
         model[:] = model[latest]
         # d has not jumped at each of them.
         model['derivatives'][latest != numbers] %= DERIVATIVES + 1
-
-    def _back(self, ends: bool = False) -> Floats:
-        """Return the estimates that are due now, or all that wait where the recording ends."""
-        rows = self._rows[self._done : self._count]
-        end, lag = len(rows), None if ends else self._lag
-        if lag is None and not ends:
-            end = 0
-            if len(rows) >= self._wait:
-                end = self._passes.settled(rows)
-                self._wait = len(rows) - end + BLOCK
-        found = self._passes.back(rows, end, lag)
-        self._done += len(found)
-        return found  # type: ignore[no-any-return]
 
     def _handed_out(self, smoothed: Floats) -> Trajectory:
         """Return the oldest rows with their smoothed estimates; they wait no more."""
