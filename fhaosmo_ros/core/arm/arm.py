@@ -11,7 +11,7 @@ from fhaosmo_ros.core.arm.bank import Bank
 from fhaosmo_ros.core.arm.calibration import Calibration
 from fhaosmo_ros.core.arm.doubts import Doubts
 from fhaosmo_ros.core.arm.model import ArmModel
-from fhaosmo_ros.core.arm.samples import Clock, Noise, Samples
+from fhaosmo_ros.core.arm.samples import Noise, Samples
 from fhaosmo_ros.core.parameters.arm import ARM_PARAMETERS
 from fhaosmo_ros.core.parameters.declaration import Parameters
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
@@ -58,8 +58,6 @@ ELSEWHERE = 0.02
 """By so much forces on each link still count in a contact, however sure another link is."""
 SLIDING = 0.005
 """s: memory of the differences of positions that friction is computed from."""
-FAULTS = ('too strong', 'beyond limits', 'too fast')
-"""What an effort, a position and a velocity can be that no arm has."""
 ANEW = ('clock set back', 'restarts', 'jumped', 'diverged')
 """What makes the estimates begin anew."""
 
@@ -144,7 +142,7 @@ class Arm:
         self.adopt(p)
         self._of_position = p['measurement'] == 'position'
         self._with_gravity = p['effort'] != 'gravity_compensated'
-        self._delay = int(p['torque_delay'] * 1e9)
+        self._delay = p['torque_delay']
         given = self._values('torque_constants')
         self._constants = np.where(given == 1.0, known.torque_constants, given)
         scale = model.torque_of_weight()
@@ -173,7 +171,6 @@ class Arm:
         self._rest, self._tare = np.zeros((2, n))
         self.counters: Counter[str] = Counter()
         self.problem = ''
-        self._newest: int | None = None  # stamp
         self.reset()
 
     def __reduce__(self) -> NoReturn:
@@ -194,13 +191,18 @@ class Arm:
     def reset(self) -> None:
         """Begin anew with the next sample."""
         with self._alone:
-            self._waiting: deque[tuple[int, int, Floats]] = deque()  # stamps, times and samples
-            self._entrance = Clock()  # of samples that wait until their effort has come
-            self._velocity: Floats | None = None  # estimated
-            self._contact = False
-            self._looked, self._evidence = 0, self._rest  # stamp, and log-likelihood of each link
-            self.doubts = Doubts(self.model, self._with_gravity, np.sqrt(self._model_variance))
             self._samples.reset()
+            self._forget()
+
+    def _forget(self) -> None:
+        # Times, positions, and those summed up beside velocities, until their effort has come.
+        self._kept: deque[tuple[float, Floats, Floats]] = deque()
+        self._then: tuple[float | None, Floats] = None, self._rest  # time of the latest effort
+        self._velocity: Floats | None = None  # estimated
+        self._contact = False
+        self._looked, self._evidence = 0, self._rest  # stamp, and log-likelihood of each link
+        self._reach = np.zeros((len(self._rest), len(self._rest)))
+        self.doubts = Doubts(self.model, self._with_gravity, np.sqrt(self._model_variance))
 
     def adopt(self, parameters: Parameters) -> None:
         """Go on with other live parameters; raise ConfigurationError for a bad payload."""
@@ -246,84 +248,76 @@ class Arm:
             except (TypeError, ValueError):
                 return self._refuse('wrong size')  # or no numbers
             sample[0] *= self._constants
-            kind = self._samples.fault(sample)
-            if kind >= 0:
-                return self._refuse(FAULTS[kind] if np.isfinite(sample).all() else 'not finite')
-            if self._newest is not None and stamp <= self._newest:
-                if stamp > self._newest - MAX_GAP * 1e9:
-                    return self._refuse('not newer')
-                self._refuse('clock set back')
-            self._newest = stamp
+            samples = self._samples
+            problem = samples.take(stamp, sample, self._velocity, self._bank.motion)
+            if problem:
+                return self._refuse(problem)
             if self._delay:
                 return self._go_on_late(stamp, sample)
-            return self._go_on(stamp, stamp, sample)
+            return self._go_on(stamp, sample[:2], samples.h, samples.change, samples.speed)
 
     def _refuse(self, problem: str) -> ArmEstimate | None:
         """Count a sample that is not used, and begin anew where that has to be."""
         if problem in ANEW:
-            self.reset()
-        self.problem = problem
-        self.counters[problem] += 1
+            self._forget()
+        if problem != 'first':
+            self.problem = problem
+            self.counters[problem] += 1
         return None
 
     def _go_on_late(self, stamp: int, sample: Floats) -> ArmEstimate | None:
-        """Go on to an earlier time: the effort is as old as that, and the rest was kept."""
-        if self._waiting and stamp - self._waiting[-1][0] > MAX_GAP * 1e9:
-            self._refuse('restarts')
-        kept, time = self._waiting, stamp
-        if kept:
-            newest, latest, before = kept[-1]
-            moved, h = self._samples.between(before[1], sample[1]), (stamp - newest) * 1e-9
-            known = self._rest if self._velocity is None else self._velocity
-            variance = self._samples.noise.variance[1]
-            time = latest + round(1e9 * self._entrance.interval(h, moved, known, variance))
-        kept.append((stamp, time, sample))
-        then = time - self._delay
-        while len(kept) > 2 and kept[1][1] <= then:
+        """Go on to the time of the effort: between two samples, of which the last ones are kept."""
+        samples, kept = self._samples, self._kept
+        time, _, (way, _) = kept[-1] if kept else (0.0, None, (self._rest, None))
+        kept.append((time + samples.h, sample[1], np.array([way + samples.way, sample[2]])))
+        then = kept[-1][0] - self._delay
+        while len(kept) > 2 and kept[1][0] <= then:
             kept.popleft()
-        if len(kept) < 2 or not kept[0][1] <= then <= kept[1][1]:
+        if len(kept) < 2 or kept[0][0] > then:
             return None
-        (_, t0, before), (_, t1, after) = kept[0], kept[1]
-        share = (then - t0) / (t1 - t0)
-        between = before + share * (after - before)
-        between[0] = sample[0]
-        between[1] = before[1] + share * self._samples.between(before[1], after[1])
-        return self._go_on(stamp - self._delay, then, between)
+        (t0, _, before), (t1, q, after) = kept[0], kept[1]
+        back = (t1 - then) / (t1 - t0) * (after - before)
+        way, velocity = after - back
+        (latest, before), self._then = self._then, (then, way)
+        if latest is None:
+            return None
+        h, change = then - latest, way - before if self._of_position else velocity
+        speed = change / h if self._of_position else velocity
+        torque_and_q = np.array([sample[0], q - back[0]])
+        return self._go_on(stamp - round(1e9 * self._delay), torque_and_q, h, change, speed)
 
-    def _go_on(self, stamp: int, time: int, sample: Floats) -> ArmEstimate | None:
-        """Bring the bank to a sample that can be used; the estimate of this `time` has `stamp`."""
-        torque, q, velocity = sample
-        bank, samples = self._bank, self._samples
-        problem = samples.take(time, sample, self._velocity, bank.motion)
-        if problem not in ('', 'first'):
-            self._refuse(problem)
-            if problem != 'restarts':
-                return None
-            samples.take(time, sample, None, bank.motion)  # as the first one
-        if problem:
-            self._first = self._drive(q, velocity, torque, velocity)
-            self._reach = np.sum(self.model.reach_of_links(q), axis=0)
-            return None
-        h, speed = samples.h, samples.speed
-        if self._velocity is None:
-            mass, drive = self._first
-            wide = 2.0 * self._variance / (h * h if self._of_position else 1.0)
-            spread = (mass * wide) @ mass.T
-            bank.start(mass, drive, mass @ speed, spread, self._model_variance)
-        if self._velocity is None or not self._of_position:
+    def _go_on(
+        self, stamp: int, torque_and_q: Floats, h: float, change: Floats, speed: Floats
+    ) -> ArmEstimate | None:
+        """Go on to a sample; within `h` seconds the joints have moved as `Samples` says."""
+        torque, q = torque_and_q
+        bank = self._bank
+        begins = self._velocity is None
+        if begins or not self._of_position:
             self._velocity = self._sliding = speed.copy()
         elif self._calibrated:
             self._sliding = self._sliding - np.expm1(-h / SLIDING) * (speed - self._sliding)
         mass, drive = self._drive(q, self._velocity, torque, self._sliding)
+        if begins:
+            wide = 2.0 * self._variance / (h * h if self._of_position else 1.0)
+            spread = (mass * wide) @ mass.T
+            bank.start(mass, drive, mass @ speed, spread, self._model_variance)
         bank.step(
-            h, mass, samples.change, self._variance, samples.vague, drive,
-            self._torque_variance, self._reach,
-        )  # fmt: skip
+            h,
+            mass,
+            change,
+            self._variance,
+            self._samples.vague,
+            drive,
+            self._torque_variance,
+            self._reach,
+        )
         self.doubts.take(h, q, torque, bank.mean[2])
         if self.doubts.text and not self.doubts.payload:
             return self._refuse('doubted')
         self._velocity = speed = self.model.velocity_of(bank.mean[1])
-        if not samples.is_possible(speed):  # C^T qd grows with its square
+        if not self._samples.is_possible(2, speed):  # C^T qd grows with its square
+            self._samples.reset()
             return self._refuse('diverged')
         self.counters['used'] += 1
         return self._estimate(stamp, q, speed)

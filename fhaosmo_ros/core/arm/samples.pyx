@@ -26,6 +26,10 @@ cdef int FIRST_LEARNT = 10, LONGEST_LEARNT = 1000
 cdef double LARGEST = 9.0
 
 
+FAULTS = ('too strong', 'beyond limits', 'too fast')
+"""What an effort, a position and a velocity can be that no arm has."""
+
+
 cdef class Noise:
     """
     The variance of the noise of samples, followed by their third differences.
@@ -54,18 +58,16 @@ cdef class Noise:
         """Take the next sample as the first one."""
         self.seen = 0
 
-    cpdef take(self, const double[:, ::1] sample):
+    cdef void take(self, const double[:, ::1] sample) noexcept:
         """Take a sample, (r, n)."""
         cdef double[:, :, ::1] b = self.before
         cdef double change, square, found
-        cdef int i, k, rows = self.now.shape[0], n = self.now.shape[1]
+        cdef Py_ssize_t i, k
         cdef bint known = self.seen >= 3
-        if sample.shape[0] != rows or sample.shape[1] != n:
-            raise ValueError(f'expected a sample of shape {(rows, n)}')
         if known:
             self.count = min(self.count + 1, LONGEST_LEARNT)
-        for i in range(rows):
-            for k in range(n):
+        for i in range(self.now.shape[0]):
+            for k in range(self.now.shape[1]):
                 if known:
                     change = sample[i, k] - 3.0 * (b[2, i, k] - b[1, i, k]) - b[0, i, k]
                     square = fmin(change * change / 20.0, LARGEST * self.now[i, k])  # 1+9+9+1
@@ -185,6 +187,7 @@ cdef class Clock:
         self.period += 6.0 / (n * (n + 1.0)) * off / steps
         return even
 
+
 cdef class Samples:
     """
     How the joints have moved from one sample to the next, in which time, and how noisy that is.
@@ -203,23 +206,23 @@ cdef class Samples:
     turning : (n,) array of bool
         Joints whose angle has no end.
     longest : float
-        Seconds between two samples that belong together.
+        Seconds without a sample, or back in time, after which one is a first one.
     of_position : bool
         True if positions say how the joints have moved, False if velocities do.
 
     """
 
     cdef readonly double h, vague  # time in which the joints moved, and share that is not known
-    cdef readonly object change, speed  # (n,): what `Bank.step` takes, and velocities
+    cdef readonly object way, change, speed  # (n,): moved, what `Bank.step` takes, velocities
     cdef readonly Noise noise
     cdef readonly Clock clock
     cdef double[:, ::1] lowest, highest
-    cdef double[::1] step, stopping, rest, position, way, rate
+    cdef double[::1] step, stopping, rest, position, moved, rate
     cdef unsigned char[::1] turning
     cdef double longest
     cdef bint of_position, begun, still
     cdef int repeats  # samples in a row that a driver has published once more
-    cdef long long time
+    cdef long long time, newest  # of the latest sample that counts, and of any
 
     def __cinit__(
         self, Noise noise not None, lowest, highest, step, stopping, turning, double longest,
@@ -233,10 +236,10 @@ cdef class Samples:
         self.longest, self.of_position = longest, of_position
         self.lowest, self.highest, self.step, self.stopping = lowest, highest, step, stopping
         self.turning = np.array(turning, dtype=np.uint8)
-        self.rest, self.position = np.zeros(n), np.zeros(n)
-        self.way, self.rate = np.zeros(n), np.zeros(n)
-        self.speed = np.asarray(self.rate)
-        self.change = np.asarray(self.way) if of_position else self.speed
+        self.rest, self.position, self.moved, self.rate = np.zeros((4, n))
+        self.way, self.speed = np.asarray(self.moved), np.asarray(self.rate)
+        self.change = self.way if of_position else self.speed
+        self.newest = -(1 << 62)
         self.reset()
 
     def reset(self):
@@ -246,35 +249,15 @@ cdef class Samples:
         self.clock.reset()
         self.noise.reset()
 
-    def fault(self, const double[:, ::1] sample):
-        """Return the first row with a number that no arm can have, -1 if there is none."""
-        cdef int i, k, n = self.step.shape[0]
-        if sample.shape[0] != 3 or sample.shape[1] != n:
-            raise ValueError(f'expected a sample of shape {(3, n)}')
-        for i in range(3):
-            for k in range(n):
-                if not self.lowest[i, k] < sample[i, k] < self.highest[i, k]:
-                    return i
-        return -1
-
-    def is_possible(self, const double[::1] velocity):
-        """Return False where a joint, of (n,), is faster than any, or not finite."""
-        cdef int k
-        cdef bint possible = velocity.shape[0] == self.step.shape[0]
-        for k in range(velocity.shape[0] if possible else 0):
-            possible = possible and fabs(velocity[k]) < self.highest[2, k]
-        return possible
-
-    cdef double shorter(self, int k, double moved) noexcept:
-        """Return how far a joint has moved; one without an end has gone the shorter way."""
-        return moved - 2.0 * M_PI * floor(moved / (2.0 * M_PI) + 0.5) if self.turning[k] else moved
-
-    def between(self, const double[::1] before, const double[::1] after):
-        """Return how far the joints have moved, (n,)."""
-        cdef Py_ssize_t k, n = self.step.shape[0]
-        if not n == before.shape[0] == after.shape[0]:
-            raise ValueError(f'expected arrays of {n} joints')
-        return np.array([self.shorter(k, after[k] - before[k]) for k in range(n)])
+    cpdef bint is_possible(self, int row, const double[::1] values) except -1:
+        """Return True if an arm can have these values, (n,), in a row of a sample."""
+        cdef int k, n = self.step.shape[0]
+        if not 0 <= row < 3 or values.shape[0] != n:
+            raise ValueError(f'expected a row of 3 and {n} joints')
+        for k in range(n):
+            if not self.lowest[row, k] < values[k] < self.highest[row, k]:
+                return False
+        return True
 
     def take(
         self, long long time, const double[:, ::1] sample, velocity, const double[::1] motion
@@ -295,27 +278,36 @@ cdef class Samples:
         Returns
         -------
         str
-            Empty if the sample can be used; 'first' if there was none before it; 'standing still',
-            'repeated' (a joint that moves by more than a step of its encoder shows it), 'restarts'
-            (after a gap) and 'jumped' if it is not used.
+            Empty if the sample can be used, else why not: one of `FAULTS` or 'not finite', 'not
+            newer', 'standing still', 'repeated' (a joint that moves by more than a step of its
+            encoder shows it), 'jumped', after which the next sample is the first; and the first
+            one itself, 'first', 'clock set back' or 'restarts' (after a gap).
 
         """
         cdef const double[::1] known = self.rest if velocity is None else velocity
-        cdef int k, n = self.step.shape[0]
+        cdef int i, k, n = self.step.shape[0]
         cdef double over  # what divides `motion` to have p
-        cdef bint moves = False, repeated = False
+        cdef bint moves = False, repeated = False, back
         if sample.shape[0] != 3 or not (
             n == sample.shape[1] == known.shape[0] == motion.shape[0]
         ):
             raise ValueError(f'expected arrays of {n} joints')
-        if not self.begun:
-            self.keep(time, sample)
-            return 'first'
+        for i in range(3):
+            if not self.is_possible(i, sample[i]):
+                return FAULTS[i] if np.isfinite(sample).all() else 'not finite'
+        back = time < self.newest - self.longest * 1e9
+        if time <= self.newest and not back:
+            return 'not newer'
+        self.newest = time
+        if back or not self.begun:
+            return self.begin(time, sample, 'clock set back' if back else 'first')
         over = self.h if self.of_position else 1.0
         self.h = (time - self.time) * 1e-9
         for k in range(n):
-            self.way[k] = self.shorter(k, sample[1, k] - self.position[k])
-            moves = moves or self.way[k] != 0.0
+            self.moved[k] = sample[1, k] - self.position[k]
+            if self.turning[k]:  # the shorter way
+                self.moved[k] -= 2.0 * M_PI * floor(self.moved[k] / (2.0 * M_PI) + 0.5)
+            moves = moves or self.moved[k] != 0.0
         if moves:
             self.still, self.repeats = False, 0
         elif velocity is not None:  # to the bit, and all joints at once
@@ -328,20 +320,25 @@ cdef class Samples:
         if self.still:
             return 'standing still'
         if self.h > self.longest:
-            return 'restarts'
-        self.h = self.clock.interval(self.h, self.way, known, self.noise.now[1])
+            return self.begin(time, sample, 'restarts')
+        self.h = self.clock.interval(self.h, self.moved, known, self.noise.now[1])
         for k in range(n):
-            if fabs(self.way[k]) > self.highest[2, k] * self.h + OFF * self.step[k]:
+            if fabs(self.moved[k]) > self.highest[2, k] * self.h + OFF * self.step[k]:
+                self.reset()
                 return 'jumped'
-            self.rate[k] = self.way[k] / self.h if self.of_position else sample[2, k]
+            self.rate[k] = self.moved[k] / self.h if self.of_position else sample[2, k]
         self.vague = self.clock.vague if self.of_position else 0.0
         self.noise.take(sample)
         self.keep(time, sample)
         return ''
 
+    cdef str begin(self, long long time, const double[:, ::1] sample, str problem):
+        """Take a sample as the first one, and return why it is that."""
+        self.reset()
+        self.keep(time, sample)
+        return problem
+
     cdef void keep(self, long long time, const double[:, ::1] sample) noexcept:
         """Remember a sample."""
-        cdef int k
         self.begun, self.time = True, time
-        for k in range(self.step.shape[0]):
-            self.position[k] = sample[1, k]
+        self.position[:] = sample[1]
