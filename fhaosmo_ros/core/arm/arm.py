@@ -197,7 +197,7 @@ class Arm:
     def _forget(self) -> None:
         # Times, positions, and those summed up beside velocities, until their effort has come.
         self._kept: deque[tuple[float, Floats, Floats]] = deque()
-        self._then: tuple[float | None, Floats] = None, self._rest  # time of the latest effort
+        self._then = np.nan, self._rest  # when the latest effort was, and where
         self._velocity: Floats | None = None  # estimated
         self._contact = False
         self._looked, self._evidence = 0, self._rest  # stamp, and log-likelihood of each link
@@ -254,7 +254,8 @@ class Arm:
                 return self._refuse(problem)
             if self._delay:
                 return self._go_on_late(stamp, sample)
-            return self._go_on(stamp, sample[:2], samples.h, samples.change, samples.speed)
+            effort, position, _ = sample
+            return self._go_on(stamp, effort, position, samples.h, samples.change, samples.speed)
 
     def _refuse(self, problem: str) -> ArmEstimate | None:
         """Count a sample that is not used, and begin anew where that has to be."""
@@ -266,7 +267,7 @@ class Arm:
         return None
 
     def _go_on_late(self, stamp: int, sample: Floats) -> ArmEstimate | None:
-        """Go on to the time of the effort: between two samples, of which the last ones are kept."""
+        """Go on to the time when the effort was measured, between two samples before."""
         samples, kept = self._samples, self._kept
         time, _, (way, _) = kept[-1] if kept else (0.0, None, (self._rest, None))
         kept.append((time + samples.h, sample[1], np.array([way + samples.way, sample[2]])))
@@ -278,40 +279,33 @@ class Arm:
         (t0, _, before), (t1, q, after) = kept[0], kept[1]
         back = (t1 - then) / (t1 - t0) * (after - before)
         way, velocity = after - back
-        (latest, before), self._then = self._then, (then, way)
-        if latest is None:
+        h, moved, self._then = then - self._then[0], way - self._then[1], (then, way)
+        speed = moved / h if self._of_position else velocity
+        if np.isnan(h):
             return None
-        h, change = then - latest, way - before if self._of_position else velocity
-        speed = change / h if self._of_position else velocity
-        torque_and_q = np.array([sample[0], q - back[0]])
-        return self._go_on(stamp - round(1e9 * self._delay), torque_and_q, h, change, speed)
+        change = moved if self._of_position else speed
+        stamp -= round(1e9 * self._delay)
+        return self._go_on(stamp, sample[0], q - back[0], h, change, speed)
 
     def _go_on(
-        self, stamp: int, torque_and_q: Floats, h: float, change: Floats, speed: Floats
+        self, stamp: int, torque: Floats, q: Floats, h: float, change: Floats, speed: Floats
     ) -> ArmEstimate | None:
-        """Go on to a sample; within `h` seconds the joints have moved as `Samples` says."""
-        torque, q = torque_and_q
-        bank = self._bank
-        begins = self._velocity is None
-        if begins or not self._of_position:
-            self._velocity = self._sliding = speed.copy()
+        """Go on to a sample; how the joints have moved within `h` seconds is as of `Samples`."""
+        bank, before = self._bank, self._velocity
+        if before is None or not self._of_position:
+            self._sliding = speed.copy()
         elif self._calibrated:
             self._sliding = self._sliding - np.expm1(-h / SLIDING) * (speed - self._sliding)
-        mass, drive = self._drive(q, self._velocity, torque, self._sliding)
-        if begins:
+        known = self._sliding if before is None or not self._of_position else before
+        mass, drive = self._drive(q, known, torque, self._sliding)
+        if before is None:
             wide = 2.0 * self._variance / (h * h if self._of_position else 1.0)
             spread = (mass * wide) @ mass.T
             bank.start(mass, drive, mass @ speed, spread, self._model_variance)
         bank.step(
-            h,
-            mass,
-            change,
-            self._variance,
-            self._samples.vague,
-            drive,
-            self._torque_variance,
+            h, mass, change, self._variance, self._samples.vague, drive, self._torque_variance,
             self._reach,
-        )
+        )  # fmt: skip
         self.doubts.take(h, q, torque, bank.mean[2])
         if self.doubts.text and not self.doubts.payload:
             return self._refuse('doubted')

@@ -5,9 +5,8 @@ from libc.math cimport fabs, floor, fmax, fmin, INFINITY, M_PI, sqrt
 
 import numpy as np
 
-# Stamps are evened out over so many samples. Even intervals are used where velocities by them are
-# rough by the factor at most; of what was remembered of both, KEEP is still remembered one sample
-# later.
+# Stamps are evened out over so many samples. Even intervals are used where motion misses them by
+# the factor at most; of what was remembered of both, KEEP is still remembered one sample later.
 cdef int LONGEST = 200
 cdef double BETTER = 0.8, KEEP = 0.995
 # The median of so many intervals is the period that the even clock begins with.
@@ -85,7 +84,7 @@ cdef class Clock:
     of the host wakes up. A stamp that is 0.1 ms off makes a velocity of 10 % more, for one sample.
     So stamps are evened out, by the least squares of a line (constant period) over the last
     samples, written as an alpha-beta filter; whole periods may be missing. Intervals are those of
-    the stamps or even ones, whichever make the smoother velocities.
+    the stamps or even ones, whichever agree better with how the joints move on.
 
     A host that hangs stamps one sample late, and those after it at nearly the same time. Where
     stamps and even clock do not agree to half a period, or samples seem to be missing, encoders
@@ -99,8 +98,7 @@ cdef class Clock:
     cdef double period  # s
     cdef int count  # stamps evened out
     cdef list first  # intervals before the even clock begins
-    cdef double[:, ::1] speeds  # at the sample before, by stamps and by even intervals
-    cdef double rough_by_stamps, rough_by_even
+    cdef double missed_by_stamps, missed_by_even  # rad^2, of the latest samples
 
     def __cinit__(self):
         self.reset()
@@ -109,8 +107,8 @@ cdef class Clock:
         """Forget everything."""
         self.even, self.count = False, 0
         self.vague = self.phase = self.period = 0.0
-        self.first, self.speeds = [], None
-        self.rough_by_stamps = self.rough_by_even = 0.0
+        self.missed_by_stamps = self.missed_by_even = 0.0
+        self.first = []
 
     cpdef double interval(
         self, double h, const double[::1] moved, const double[::1] velocity,
@@ -121,8 +119,7 @@ cdef class Clock:
 
         `velocity` is the one before, and `variance` that of the noise of positions.
         """
-        cdef double by_stamps = 0.0, by_even = 0.0, total = 0.0, along = 0.0, square = 0.0
-        cdef double noise = 0.0, even, one, two
+        cdef double total = 0.0, along = 0.0, square = 0.0, noise = 0.0, even
         cdef double told = h, sure = INFINITY  # time by the motion, and how exact it is (s)
         cdef Py_ssize_t k, n = moved.shape[0]
         if not n == velocity.shape[0] == variance.shape[0]:
@@ -138,24 +135,18 @@ cdef class Clock:
                 sure = sqrt(LARGEST * noise / square)
         even = self.evened(h, told, sure)
         if fabs(h - even) > 0.5 * self.period or (self.count == 0 and sure < h):
-            self.speeds = None
             if fabs(h - told) < fabs(even - told):
                 even = h
             self.vague = fabs(even - told) / fmax(fabs(told), 1e-15)
             return even
-        if self.speeds is None or self.speeds.shape[1] != n:
-            self.speeds = np.array([np.divide(moved, h), np.divide(moved, even)])
-        for k in range(n):
-            one, two = moved[k] / h, moved[k] / even
-            by_stamps += (one - self.speeds[0, k]) * (one - self.speeds[0, k])
-            by_even += (two - self.speeds[1, k]) * (two - self.speeds[1, k])
-            self.speeds[0, k], self.speeds[1, k] = one, two
-        self.rough_by_stamps = KEEP * self.rough_by_stamps + by_stamps
-        self.rough_by_even = KEEP * self.rough_by_even + by_even
-        self.even = self.rough_by_even < BETTER * self.rough_by_stamps
-        one = even if self.even else h
-        self.vague = fabs(h - even) / one
-        return one
+        # By how much the joints miss where their velocity would have brought them.
+        self.missed_by_stamps *= KEEP
+        self.missed_by_stamps += total - 2.0 * h * along + h * h * square
+        self.missed_by_even *= KEEP
+        self.missed_by_even += total - 2.0 * even * along + even * even * square
+        self.even = self.missed_by_even < BETTER * self.missed_by_stamps
+        self.vague = fabs(h - even) / (even if self.even else h)
+        return even if self.even else h
 
     cdef double evened(self, double h, double told, double sure):
         """Go on by a stamp, `h` after the one before, and return the even interval."""
