@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What samples of an arm say by themselves: which can be used, their noise, and their time."""
 
-from libc.math cimport fabs, floor, fmax, fmin, INFINITY, M_PI, sqrt
+from libc.math cimport fabs, floor, fmax, fmin, INFINITY, isnan, M_PI, NAN, sqrt
 
 import numpy as np
 
@@ -45,24 +45,24 @@ cdef class Noise:
     cdef readonly object variance  # (r, n)
     cdef double[:, ::1] now, least, most
     cdef double[:, :, ::1] before  # the three samples before
-    cdef int seen, count
+    cdef int count  # of what is averaged
 
     def __cinit__(self, size, least, most):
         self.now, self.least, self.most = np.square(np.broadcast_arrays(size, least, most))
         self.variance = np.asarray(self.now)
-        self.before = np.zeros((3, *self.variance.shape))
-        self.seen, self.count = 0, FIRST_LEARNT
+        self.before = np.full((3, *self.variance.shape), np.nan)
+        self.count = FIRST_LEARNT
 
     def reset(self):
         """Take the next sample as the first one."""
-        self.seen = 0
+        self.before[:, :, :] = NAN
 
     cdef void take(self, const double[:, ::1] sample) noexcept:
         """Take a sample, (r, n)."""
         cdef double[:, :, ::1] b = self.before
         cdef double change, square, found
         cdef Py_ssize_t i, k
-        cdef bint known = self.seen >= 3
+        cdef bint known = not isnan(b[0, 0, 0])
         if known:
             self.count = min(self.count + 1, LONGEST_LEARNT)
         for i in range(self.now.shape[0]):
@@ -73,7 +73,6 @@ cdef class Noise:
                     found = self.now[i, k] + (square - self.now[i, k]) / self.count
                     self.now[i, k] = fmin(fmax(found, self.least[i, k]), self.most[i, k])
                 b[0, i, k], b[1, i, k], b[2, i, k] = b[1, i, k], b[2, i, k], sample[i, k]
-        self.seen = min(self.seen + 1, 3)
 
 
 cdef class Clock:
@@ -320,16 +319,11 @@ cdef class Samples:
             self.rate[k] = self.moved[k] / self.h if self.of_position else sample[2, k]
         self.vague = self.clock.vague if self.of_position else 0.0
         self.noise.take(sample)
-        self.keep(time, sample)
+        self.time, self.position[:] = time, sample[1]
         return ''
 
     cdef str begin(self, long long time, const double[:, ::1] sample, str problem):
         """Take a sample as the first one, and return why it is that."""
         self.reset()
-        self.keep(time, sample)
+        self.begun, self.time, self.position[:] = True, time, sample[1]
         return problem
-
-    cdef void keep(self, long long time, const double[:, ::1] sample) noexcept:
-        """Remember a sample."""
-        self.begun, self.time = True, time
-        self.position[:] = sample[1]
