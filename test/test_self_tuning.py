@@ -176,6 +176,18 @@ def test_a_host_that_stamps_later_for_dozens_of_samples(seed):
     assert np.abs(estimated(SELF_TUNING, late, noisy).unknown_input).max() < 2.0 * np.abs(d).max()
 
 
+@pytest.mark.parametrize('seed', [0, 1, 2])
+def test_a_y_that_is_sampled_at_uneven_times_is_not_noisy(seed):
+    """A host that is busy samples late, and stamps rightly: d is followed well."""
+    random = np.random.default_rng(seed)
+    intervals = PERIOD * random.uniform(0.3, np.where(random.random(8000) < 0.15, 9.0, 1.2))
+    t = np.cumsum(intervals)
+    model = {'order': 2, 'phi': ['0', '-0.8*z2']}
+    truth = Plant(**model, disturbance_omega=3.0).simulate(np.concatenate([[0.0], t]))
+    d, found = truth.unknown_input[1:], estimated(model | SELF_TUNING, t, truth.y[1:])
+    assert rms((found.unknown_input - d)[t > 0.5 * t[-1]]) < 0.05 * rms(d)
+
+
 @pytest.mark.parametrize('noise', [0.0, 1e-5])
 @pytest.mark.parametrize('file', ['self_tuning', 'models/paper_plant'])
 def test_a_sample_that_its_host_stamps_late_is_not_rejected(case, file, noise):

@@ -18,7 +18,7 @@ from fhaosmo_ros.core.parameters.errors import ConfigurationError
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-VERSION = 7
+VERSION = 8
 """Of the names."""
 HEAD = ['version', 'flags', 'sec', 'nanosec']
 HALF = 2**32

@@ -186,6 +186,7 @@ cdef void shift(Members* m, double of_state, double miss, double variance) noexc
     for g in range(COUNT):
         m.x.z[0][g] += of_state
         m.p.zz[0][g] += variance
-    m.difference[0] += of_state - miss
+    for g in range(m.n + 2):
+        m.latest_y[g] += of_state - miss
     m.shared.unsettled = m.shared.growing = 0.0
     watch(m, m.shared.followed)

@@ -14,6 +14,7 @@ cdef enum:
     MOST_STATES = MOST_ORDER + ORDERS
     PAIRS = 78  # of MOST_ORDER states, each with itself too
     DIFFERENCES = MOST_ORDER + 2  # of y: order 0 to n + 1
+    CLOCKS = 2  # samples may be evenly spaced in time, or as their stamps say
     WINDOW = 32  # a jump of y is looked for in so many samples (D 35)
     FIRST_SAMPLES = 50  # so many tell the period and the noise before the members begin
 
@@ -144,8 +145,10 @@ cdef struct Members:
     double noise[COLOURS]  # variance of the noise of each colour, but for that of stamps
     double late[COLOURS]  # share of `jitter` that is error of the stamps (D 29)
     double used_noise[COLOURS]  # the one that P counts on
-    double difference[DIFFERENCES]  # of y at the last sample
-    double rough[COLOURS][DIFFERENCES]  # what those of order 1 to n + 1 say noise is at most
+    double latest_y[DIFFERENCES]  # the latest samples, from the last one on
+    double ages[DIFFERENCES]  # by their stamps, from the last one back (s)
+    double difference[CLOCKS][DIFFERENCES]  # of order 1 to n + 1 at the last sample
+    double rough[CLOCKS][COLOURS][DIFFERENCES]  # what these say that noise is at most
     double flow[MOST_STATES][MOST_STATES]  # derivative of the prediction to the next sample
     double window[WINDOW]  # innovations over their standard deviations, of one member (D 35)
 

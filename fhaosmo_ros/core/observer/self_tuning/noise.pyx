@@ -5,7 +5,7 @@ from libc.math cimport INFINITY, M_2_PI, erf, exp, fabs, fmax, fmin, round, sqrt
 
 from fhaosmo_ros.core.observer.self_tuning.filters cimport EXACT, HUBER
 from fhaosmo_ros.core.observer.self_tuning.members cimport (
-    COLOURS, GRID, HALF, Members, Sample, Shared, Work, fill, largest
+    CLOCKS, COLOURS, DIFFERENCES, GRID, HALF, Members, Sample, Shared, Work, fill, largest
 )
 from fhaosmo_ros.core.vectors cimport VECTORISED
 from fhaosmo_ros.core.observer.structure cimport LOST_SAMPLES
@@ -69,7 +69,7 @@ cdef void follow_quantum(Members* m) noexcept nogil:
     cdef bint fits
     if step <= ROUNDED * fabs(y):
         return
-    change = fabs(m.difference[2])  # from the step before, which may be 0
+    change = fabs(m.latest_y[0] - 2.0 * m.latest_y[1] + m.latest_y[2])  # from the step before
     shared.goes_back += ((1.0 if change > 1.5 * step else 0.0) - shared.goes_back) / QUICK_SAMPLES
     fits = is_multiple(step, shared.quantum, y)
     if not fits:
@@ -90,39 +90,89 @@ cdef double rounding(Members* m) noexcept nogil:
     return 0.0 if hidden or m.shared.lattice < LATTICE_SHARE else quanta
 
 
-cdef void follow_differences(Members* m, double y) noexcept nogil:
+cdef void differences(
+    const double* y, const double* ages, double unit, int order, double* found
+) noexcept nogil:
+    """
+    Write divided differences of the samples 0 .. p, of order p = 1 .. `order` (D 29).
+
+    Each is divided by what makes white noise count with its own variance.
+    """
+    cdef double weights[DIFFERENCES]
+    cdef double total, square
+    cdef int p, j
+    weights[0] = 1.0
+    for p in range(1, order + 1):
+        weights[p] = 0.0
+        for j in range(p):
+            weights[j] *= unit / (ages[p] - ages[j])
+            weights[p] -= weights[j]
+        total = square = 0.0
+        for j in range(p + 1):
+            total += weights[j] * y[j]
+            square += weights[j] * weights[j]
+        found[p] = total / sqrt(square)
+
+
+cdef double bound_of_noise(Members* m, int colour, int order) noexcept nogil:
+    """Return what differences of an order say that the variance of the noise is at most."""
+    return fmin(m.rough[0][colour][order], m.rough[1][colour][order])
+
+
+cdef double usual_speed(Members* m) noexcept nogil:
+    """Return the mean square of the speed of y of late, by its steps."""
+    return 2.0 * m.rough[0][0][1] / (m.shared.steady_period * m.shared.steady_period)
+
+
+cdef double share_of_stamps(Members* m, double share, double most) noexcept nogil:
+    """
+    Return a share of `jitter` that is error of the stamps, if y is off by `most` for it at most.
+
+    Differences at the stamps have that in them.
+    """
+    cdef double prompt = PROMPT * m.shared.steady_period
+    cdef double usual = fmax(m.shared.jitter * usual_speed(m), 1e-300)
+    share = fmin(share, ROUGH * fmin(most / usual, 1.0))
+    return fmax(share, fmin(prompt * prompt / m.shared.jitter, 1.0))
+
+
+cdef void follow_differences(Members* m, double y, double h) noexcept nogil:
     """
     Follow what the differences of y say that the noise of each colour is at most (D 29).
 
-    White noise w adds C(2p, p) times its variance to that of a difference of order p. What y does
-    besides adds to it, so that the smallest of the variances is an upper bound. In the sample,
-    `roughness` is the square of the difference of the order that bounds white noise, over its
-    usual size; `uneven` that of the highest one, as a variance of white noise: of the order of the
-    noise if noise is why y is off its prediction, and far less if d has moved it there.
+    What y does besides adds to them, so that the smallest of the variances is an upper bound:
+    of those of evenly spaced samples, if a host has stamped them late, and of those at the stamps,
+    if they were taken late. In the sample, `roughness` is the square of the difference of the
+    order that bounds white noise, over its usual size; `uneven` that of the highest one, as a
+    variance of white noise: of the order of the noise if noise is why y is off its prediction, and
+    far less if d has moved it there.
     """
     cdef Sample* sample = &m.work.sample
-    cdef double value = y, binomial = 1.0, least = ROUNDED * m.shared.first_noise
-    cdef double bound = INFINITY, before, value_before, white, r, grown, average = ROUGH_SAMPLES
-    cdef int p, c
+    cdef double even[DIFFERENCES]
+    cdef double now[DIFFERENCES]
+    cdef double least = ROUNDED * m.shared.first_noise, unit = m.shared.steady_period
+    cdef double bound = INFINITY, white, r, grown, average = ROUGH_SAMPLES
+    cdef int p, c, clock, order = m.n + 1
     if m.shared.grown > STEADY:
         average = QUICK_SAMPLES
     sample.roughness, sample.roughness_before = 0.0, m.shared.roughness
-    for p in range(m.n + 2):
-        before, value_before = m.difference[p], value
-        m.difference[p] = value
-        value = value_before - before
-        if p == 0:
-            continue
-        binomial *= (4.0 * p - 2.0) / p
-        for c in range(COLOURS):
-            white = value_before - m.correlation[GRID.first[c]] * before
-            r = white * white / (m.rough[c][p] * binomial)
-            if c == 0:
-                sample.uneven = white * white / binomial
-                if m.rough[0][p] < bound:
-                    bound, sample.roughness = m.rough[0][p], r
-            grown = 1.0 + (fmin(r, HUBER * HUBER) / CLIPPED - 1.0) / average
-            m.rough[c][p] = fmax(m.rough[c][p] * grown, least)
+    for p in range(order, 0, -1):
+        m.latest_y[p], m.ages[p] = m.latest_y[p - 1], m.ages[p - 1] + fmax(h, EXACT * unit)
+        even[p] = p * unit
+    m.latest_y[0] = y
+    m.ages[0] = even[0] = 0.0
+    for clock in range(CLOCKS):
+        differences(m.latest_y, &m.ages[0] if clock else &even[0], unit, order, now)
+        for p in range(1, order + 1):
+            for c in range(COLOURS):
+                white = now[p] - m.correlation[GRID.first[c]] * m.difference[clock][p]
+                r = white * white / m.rough[clock][c][p]
+                if clock == 1 and c == 0 and m.rough[1][0][p] < bound:
+                    bound, sample.roughness = m.rough[1][0][p], r
+                grown = 1.0 + (fmin(r, HUBER * HUBER) / CLIPPED - 1.0) / average
+                m.rough[clock][c][p] = fmax(m.rough[clock][c][p] * grown, least)
+            m.difference[clock][p] = now[p]
+    sample.uneven = now[order] * now[order]
     m.shared.roughness += SHORT_SHARE * (
         fmin(sample.roughness, HUBER * HUBER) - m.shared.roughness
     )
@@ -205,8 +255,9 @@ cdef VECTORISED follow_noise(Members* m) noexcept nogil:
     cdef double weights[COLOURS]
     cdef double squares[COLOURS]
     cdef double variance, ratio, off, weight, least, most, more, share, rest
+    cdef double by_stamps
     cdef double average = sample.average
-    cdef double widest = sample.largest, prompt = PROMPT * m.shared.steady_period
+    cdef double widest = sample.largest
     cdef int c, p
     cdef Py_ssize_t g, active = m.shared.active
     for g in range(active):
@@ -237,13 +288,14 @@ cdef VECTORISED follow_noise(Members* m) noexcept nogil:
         more = (squares[c] / weights[c] / CLIPPED - 1.0) / average
         share = m.noise[c] / w.now[c]  # who adds to the noise answers for it
         m.late[c] *= 1.0 + (1.0 - share) * more
-        m.late[c] = fmax(fmin(m.late[c], ROUGH), fmin(prompt * prompt / m.shared.jitter, 1.0))
         m.noise[c] *= 1.0 + share * more
-        most = m.rough[c][1]
+        most, by_stamps = bound_of_noise(m, c, 1), m.rough[1][c][1]
         for p in range(2, m.n + 2):
-            most = fmin(most, m.rough[c][p])
+            most = fmin(most, bound_of_noise(m, c, p))
+            by_stamps = fmin(by_stamps, m.rough[1][c][p])
+        m.late[c] = share_of_stamps(m, m.late[c], by_stamps)
         m.noise[c] = fmax(fmin(m.noise[c], ROUGH * most), sample.floor)
-        if m.rough[c][m.n + 1] > FLAT * m.rough[c][m.n]:
-            rest = m.rough[c][m.n + 1] - m.shared.of_stamps
+        rest = bound_of_noise(m, c, m.n + 1)
+        if rest > FLAT * bound_of_noise(m, c, m.n):
             m.noise[c] = fmax(m.noise[c], FLAT * FLAT * rest)
     fill_noise(m)

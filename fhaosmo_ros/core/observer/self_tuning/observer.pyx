@@ -13,11 +13,11 @@ from fhaosmo_ros.core.observer.self_tuning.jumps cimport (
     begin_growth, follow_innovations, follow_jump, has_jumped, samples_since_jump, shift, watch
 )
 from fhaosmo_ros.core.observer.self_tuning.members cimport (
-    BANDS, COLOURS, COUNT, DECAY, DIFFERENCES, FIRST_SAMPLES, GRID, HALF, IN_BAND, Line,
+    BANDS, CLOCKS, COLOURS, COUNT, DECAY, DIFFERENCES, FIRST_SAMPLES, GRID, HALF, IN_BAND, Line,
     MOST_ORDER, MOST_STATES, Members, ORDERS, Sample, Shared, WINDOW, Work, entry, find_tuning, put
 )
 from fhaosmo_ros.core.observer.self_tuning.noise cimport (
-    APART, FADED, ROUNDED, STEADY, fill_noise, find_knowing, follow_differences,
+    APART, FADED, ROUNDED, STEADY, bound_of_noise, fill_noise, find_knowing, follow_differences,
     follow_noise, follow_quantum, follow_stamps, is_likely, rounding
 )
 from fhaosmo_ros.core.observer.self_tuning.start cimport gather
@@ -53,11 +53,12 @@ RANGES = {'likeliest': (0, COUNT - 1), 'told': (0, COUNT - 1), 'followed': (0, C
 RANGES |= {'samples': (0, NOISE_SAMPLES + 1), 'moving': (0, HALF), 'active': (0, COUNT)}
 RANGES |= {'since_mark': (0, 2 * WINDOW - 1), 'far_sign': (-1, 1), 'correlation': (0, 1)}
 RANGES |= dict.fromkeys((
-    'first_y', 'difference', 'flow', 'window', 'prior', 'score', 'log_variance', 'residual',
+    'first_y', 'latest_y', 'difference', 'flow', 'window', 'prior', 'score', 'log_variance', 'residual',
     'score_before', 'z', 'd', 'gain_z', 'gain_d', 'p_zz', 'p_zd', 'p_dd',
 ), (-LARGEST, LARGEST))
 # What counts before the members run, too.
-EARLY = ('first_y', 'first_h', 'noise', 'late', 'used_noise', 'difference', 'rough', 'window')
+EARLY = ('first_y', 'first_h', 'noise', 'late', 'used_noise', 'latest_y', 'ages', 'difference')
+EARLY += ('rough', 'window')
 
 
 cdef class SelfTuning(Structure):
@@ -112,13 +113,14 @@ cdef class SelfTuning(Structure):
 
     cdef bint is_noisy(self, double y) noexcept nogil:
         """Return True if all differences of y show noise, so that it does not repeat itself."""
-        cdef double* rough = &self.members.rough[0][0]  # by white noise
-        cdef double least = fmax(self.members.shared.first_noise, rough[1])
+        cdef Members* m = self.members
+        cdef double least = fmax(m.shared.first_noise, bound_of_noise(m, 0, 1)), rough
         cdef int p
         for p in range(1, self.order + 2):
-            if not rough[p] > fmax(LEAST_NOISE * LEAST_NOISE * least, ROUNDED * y * (ROUNDED * y)):
+            rough = bound_of_noise(m, 0, p)
+            if not rough > fmax(LEAST_NOISE * LEAST_NOISE * least, ROUNDED * y * (ROUNDED * y)):
                 return False
-        return self.members.shared.active == COUNT  # else y is quantised, or none has begun
+        return m.shared.active == COUNT  # else y is quantised, or none has begun
 
     # What a structure implements
 
@@ -226,8 +228,8 @@ cdef class SelfTuning(Structure):
         sample.quanta = rounding(m)
         if choose_members(m, sample.quanta):
             weigh(m)
-        follow_differences(m, y)
         change = self.follow_interval(h)
+        follow_differences(m, y, memory.interval)
         follow_stamps(m, change)
         same = fabs(h - shared.flow_period) <= EXACT * shared.flow_period
         self.carry_flow(h, u, same)
@@ -251,7 +253,7 @@ cdef class SelfTuning(Structure):
         expect(m, h, y)
         find_knowing(m, memory.beyond > 0.0)
         expected = w.believed[shared.likeliest] * w.noise[shared.likeliest]
-        sample.floor = fmax(sample.quanta, EXACT * EXACT * m.rough[0][1])
+        sample.floor = fmax(sample.quanta, EXACT * EXACT * m.rough[0][0][1])
         sample.average = fmin(shared.samples, NOISE_SAMPLES)
         sample.kept = exp(-h / self.forgetting if self.forgetting > 0.0 else -1.0 / MEMORY)
         shared.samples = <int>sample.average + 1
@@ -418,8 +420,10 @@ cdef class SelfTuning(Structure):
             'noise': (<size_t>m.noise, (COLOURS,)),
             'late': (<size_t>m.late, (COLOURS,)),
             'used_noise': (<size_t>m.used_noise, (COLOURS,)),
-            'difference': (<size_t>m.difference, (DIFFERENCES,)),
-            'rough': (<size_t>m.rough, (COLOURS, DIFFERENCES)),
+            'latest_y': (<size_t>m.latest_y, (DIFFERENCES,)),
+            'ages': (<size_t>m.ages, (DIFFERENCES,)),
+            'difference': (<size_t>m.difference, (CLOCKS, DIFFERENCES)),
+            'rough': (<size_t>m.rough, (CLOCKS, COLOURS, DIFFERENCES)),
             'window': (<size_t>m.window, (WINDOW,)),
             'flow': (<size_t>m.flow, (MOST_STATES, MOST_STATES)),
         }

@@ -7,11 +7,12 @@ from libc.string cimport memset
 from fhaosmo_ros.core.observer.self_tuning.filters cimport EXACT
 from fhaosmo_ros.core.observer.self_tuning.jumps cimport watch
 from fhaosmo_ros.core.observer.self_tuning.members cimport (
-    COLOURS, COUNT, DECAY, DIFFERENCES, Estimates, FIRST_SAMPLES, GRID, HALF, Line, Members,
+    CLOCKS, COLOURS, COUNT, DECAY, DIFFERENCES, Estimates, FIRST_SAMPLES, GRID, HALF, Line, Members,
     ORDERS, Shared, factorial, pair, power
 )
 from fhaosmo_ros.core.observer.self_tuning.noise cimport (
-    LATTICE_SHARE, ROUNDED, divided, follow_differences, is_multiple
+    LATTICE_SHARE, ROUNDED, differences, divided, follow_differences, is_multiple,
+    share_of_stamps, usual_speed
 )
 from fhaosmo_ros.core.observer.self_tuning.weights cimport weigh
 
@@ -96,24 +97,36 @@ cdef double find_noise(Members* m, double least, double largest) noexcept nogil:
     say that the noise is at most.
     """
     cdef Shared* shared = &m.shared
-    cdef double differences[FIRST_SAMPLES]
-    cdef double values[FIRST_SAMPLES]
-    cdef double rough[DIFFERENCES]
-    cdef double quantum = find_quantum(m.first_y, ROUNDED * largest)
-    cdef double noise = INFINITY, binomial = 1.0, size, period = 0.0
-    cdef int order, i, c
-    for i in range(FIRST_SAMPLES):
-        differences[i] = m.first_y[i]
-    rough[0] = 0.0
-    for order in range(1, m.n + 2):
-        binomial *= (4.0 * order - 2.0) / order  # (2 order)! / order!^2
-        for i in range(FIRST_SAMPLES - order):
-            differences[i] = differences[i + 1] - differences[i]
-            values[i] = fabs(differences[i])
-        size = median(values, FIRST_SAMPLES - order) / MEDIAN / sqrt(binomial)
-        if size > 0.0:
-            noise = fmin(noise, size)
-        rough[order] = size * size
+    cdef double found[DIFFERENCES]
+    cdef double values[CLOCKS][DIFFERENCES][FIRST_SAMPLES]
+    cdef double rough[CLOCKS][DIFFERENCES]
+    cdef double ages[CLOCKS][FIRST_SAMPLES]
+    cdef double quantum = find_quantum(m.first_y, ROUNDED * largest), noise = INFINITY
+    cdef double by_stamps = INFINITY, size, period = 0.0
+    cdef int order, i, c, clock
+    for i in range(1, FIRST_SAMPLES):
+        period += m.first_h[i] / (FIRST_SAMPLES - 1)
+        values[0][0][i - 1] = fabs(m.first_h[i] - m.first_h[i - 1])
+    size = median(values[0][0] + 1, FIRST_SAMPLES - 2) / MEDIAN
+    shared.steady_period = period
+    shared.jitter = fmax(size * size / 6.0, (EXACT * period) * (EXACT * period))
+    ages[0][0] = ages[1][0] = 0.0
+    for i in range(1, FIRST_SAMPLES):
+        ages[0][i] = ages[0][i - 1] - period
+        ages[1][i] = ages[1][i - 1] - fmax(m.first_h[i], EXACT * period)
+    for clock in range(CLOCKS):
+        for i in range(FIRST_SAMPLES - 1):
+            order = min(m.n + 1, FIRST_SAMPLES - 1 - i)
+            differences(m.first_y + i, ages[clock] + i, period, order, found)
+            for order in range(1, order + 1):
+                values[clock][order][i] = fabs(found[order])
+        for order in range(1, m.n + 2):
+            size = median(values[clock][order], FIRST_SAMPLES - order) / MEDIAN
+            rough[clock][order] = size * size
+            if size > 0.0:
+                noise = fmin(noise, size)
+                if clock:
+                    by_stamps = fmin(by_stamps, size)
     if quantum < INFINITY:
         shared.quantum = quantum
         shared.lattice = share_of_multiples(m.first_y, quantum)
@@ -121,19 +134,16 @@ cdef double find_noise(Members* m, double least, double largest) noexcept nogil:
             noise = fmax(quantum / sqrt(12.0), noise if noise < INFINITY else 0.0)
     if noise == INFINITY:
         noise = quantum if quantum < INFINITY else least
-    for i in range(1, FIRST_SAMPLES):
-        period += m.first_h[i] / (FIRST_SAMPLES - 1)
-        values[i - 1] = fabs(m.first_h[i] - m.first_h[i - 1])
-    size = median(values + 1, FIRST_SAMPLES - 2) / MEDIAN
-    shared.steady_period = period
-    shared.jitter = fmax(size * size / 6.0, (EXACT * period) * (EXACT * period))
     noise = fmax(noise, least)
-    for order in range(m.n + 2):
-        for c in range(COLOURS):
-            m.rough[c][order] = fmax(rough[order], noise * noise)
+    for clock in range(CLOCKS):
+        rough[clock][0] = 0.0
+        for order in range(m.n + 2):
+            for c in range(COLOURS):
+                m.rough[clock][c][order] = fmax(rough[clock][order], noise * noise)
     for c in range(COLOURS):
-        m.noise[c], m.late[c] = noise * noise, 1.0
-    return sqrt(noise * noise + shared.jitter * 2.0 * rough[1] / (period * period))
+        m.noise[c] = noise * noise
+        m.late[c] = share_of_stamps(m, 1.0, by_stamps * by_stamps)
+    return sqrt(noise * noise + m.late[0] * shared.jitter * usual_speed(m))
 
 
 cdef void find_sizes(Members* m) noexcept nogil:
@@ -169,9 +179,11 @@ cdef void begin(Members* m, double noise) noexcept nogil:
         m.kappa[g], m.correlation[g] = DECAY * omega, GRID.correlation[c]
         m.tau[g] = -period / log(GRID.correlation[c]) if c > 0 else 0.0
     memset(m.difference, 0, sizeof(m.difference))
+    for j in range(n + 2):
+        m.latest_y[j], m.ages[j] = m.first_y[0], j * period
     shared.roughness = 1.0
-    for j in range(FIRST_SAMPLES):
-        follow_differences(m, m.first_y[j])
+    for j in range(1, FIRST_SAMPLES):
+        follow_differences(m, m.first_y[j], m.first_h[j])
     memset(&m.x, 0, sizeof(Estimates))
     memset(m.p.zz, 0, n * (n + 1) // 2 * sizeof(Line))
     memset(m.p.zd, 0, n * ORDERS * sizeof(Line))
