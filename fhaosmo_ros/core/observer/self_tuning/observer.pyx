@@ -53,8 +53,8 @@ RANGES = {'likeliest': (0, COUNT - 1), 'told': (0, COUNT - 1), 'followed': (0, C
 RANGES |= {'samples': (0, NOISE_SAMPLES + 1), 'moving': (0, HALF), 'active': (0, COUNT)}
 RANGES |= {'since_mark': (0, 2 * WINDOW - 1), 'far_sign': (-1, 1), 'correlation': (0, 1)}
 RANGES |= dict.fromkeys((
-    'first_y', 'latest_y', 'difference', 'flow', 'window', 'prior', 'score', 'log_variance', 'residual',
-    'score_before', 'z', 'd', 'gain_z', 'gain_d', 'p_zz', 'p_zd', 'p_dd',
+    'first_y', 'latest_y', 'difference', 'flow', 'window', 'prior', 'score', 'log_variance',
+    'residual', 'score_before', 'z', 'd', 'gain_z', 'gain_d', 'p_zz', 'p_zd', 'p_dd',
 ), (-LARGEST, LARGEST))
 # What counts before the members run, too.
 EARLY = ('first_y', 'first_h', 'noise', 'late', 'used_noise', 'latest_y', 'ages', 'difference')

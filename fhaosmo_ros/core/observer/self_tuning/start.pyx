@@ -7,8 +7,8 @@ from libc.string cimport memset
 from fhaosmo_ros.core.observer.self_tuning.filters cimport EXACT
 from fhaosmo_ros.core.observer.self_tuning.jumps cimport watch
 from fhaosmo_ros.core.observer.self_tuning.members cimport (
-    CLOCKS, COLOURS, COUNT, DECAY, DIFFERENCES, Estimates, FIRST_SAMPLES, GRID, HALF, Line, Members,
-    ORDERS, Shared, factorial, pair, power
+    CLOCKS, COLOURS, COUNT, DECAY, DIFFERENCES, Estimates, FIRST_SAMPLES, GRID, HALF, Line,
+    Members, ORDERS, Shared, factorial, pair, power
 )
 from fhaosmo_ros.core.observer.self_tuning.noise cimport (
     LATTICE_SHARE, ROUNDED, differences, divided, follow_differences, is_multiple,
