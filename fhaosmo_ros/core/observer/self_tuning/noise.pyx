@@ -37,8 +37,8 @@ cdef double ROUGH_SAMPLES = 100.0  # squared differences of y are averaged over 
 # taken to be free of that would make a d of it.
 cdef double PROMPT = 0.02
 # Where the highest differences of y are more than FLAT times those of the order below, as
-# variances of white noise, they are noise, of at least FLAT^2 times that variance, less what
-# uneven intervals make of a y that moves: what is smooth has far smaller ones.
+# variances of white noise, they are noise, of at least FLAT^2 times that variance: what is smooth
+# has far smaller ones.
 cdef double FLAT = 0.5
 cdef double ROUNDED = 1e-12  # what is less than this part of a number may be an error of 64 bits
 cdef double ROUGH = 2.0  # the variance of the noise is at most so many times what they say
@@ -182,8 +182,8 @@ cdef void follow_stamps(Members* m, double change) noexcept nogil:
     """
     Follow what changes of the interval say that the variance of the stamps is at most (D 29).
 
-    Differences of y do not show that its stamps are wrong, but innovations do. In the sample,
-    `irregular` is the square of what its own stamp may be off by, `roughness` counts it, too.
+    In the sample, `irregular` is the square of what its own stamp may be off by, and `roughness`
+    counts it, too: a single late stamp is seen there at once.
     """
     cdef Shared* shared = &m.shared
     cdef Sample* sample = &m.work.sample

@@ -98,16 +98,16 @@ cdef double find_noise(Members* m, double least, double largest) noexcept nogil:
     """
     cdef Shared* shared = &m.shared
     cdef double found[DIFFERENCES]
-    cdef double values[CLOCKS][DIFFERENCES][FIRST_SAMPLES]
+    cdef double values[DIFFERENCES][FIRST_SAMPLES]
     cdef double rough[CLOCKS][DIFFERENCES]
     cdef double ages[CLOCKS][FIRST_SAMPLES]
     cdef double quantum = find_quantum(m.first_y, ROUNDED * largest), noise = INFINITY
     cdef double by_stamps = INFINITY, size, period = 0.0
-    cdef int order, i, c, clock
+    cdef int order, most, i, c, clock
     for i in range(1, FIRST_SAMPLES):
         period += m.first_h[i] / (FIRST_SAMPLES - 1)
-        values[0][0][i - 1] = fabs(m.first_h[i] - m.first_h[i - 1])
-    size = median(values[0][0] + 1, FIRST_SAMPLES - 2) / MEDIAN
+        values[0][i - 1] = fabs(m.first_h[i] - m.first_h[i - 1])
+    size = median(values[0] + 1, FIRST_SAMPLES - 2) / MEDIAN
     shared.steady_period = period
     shared.jitter = fmax(size * size / 6.0, (EXACT * period) * (EXACT * period))
     ages[0][0] = ages[1][0] = 0.0
@@ -116,12 +116,12 @@ cdef double find_noise(Members* m, double least, double largest) noexcept nogil:
         ages[1][i] = ages[1][i - 1] - fmax(m.first_h[i], EXACT * period)
     for clock in range(CLOCKS):
         for i in range(FIRST_SAMPLES - 1):
-            order = min(m.n + 1, FIRST_SAMPLES - 1 - i)
-            differences(m.first_y + i, ages[clock] + i, period, order, found)
-            for order in range(1, order + 1):
-                values[clock][order][i] = fabs(found[order])
+            most = min(m.n + 1, FIRST_SAMPLES - 1 - i)
+            differences(m.first_y + i, ages[clock] + i, period, most, found)
+            for order in range(1, most + 1):
+                values[order][i] = fabs(found[order])
         for order in range(1, m.n + 2):
-            size = median(values[clock][order], FIRST_SAMPLES - order) / MEDIAN
+            size = median(values[order], FIRST_SAMPLES - order) / MEDIAN
             rough[clock][order] = size * size
             if size > 0.0:
                 noise = fmin(noise, size)
