@@ -61,7 +61,7 @@ docs:
 	@$(call with,docs) && exec "$$python" -m sphinx -W --keep-going -q $(ARGS) docs build/docs
 
 bench:
-	@$(call with) && exec "$$python" benchmark/run.py $(ARGS)
+	@$(call with,arm) && exec "$$python" benchmark/run.py $(ARGS)
 
 soak:
 	@$(call with) && exec "$$python" benchmark/soak.py --minutes $(MINUTES) $(ARGS)

@@ -20,6 +20,7 @@ SHOWN = (
     'CPU, estimator / empty node, 7 joints 1000 Hz, estimates 100 Hz',
     'samples lost, y 1000 Hz, estimates 1000 Hz',
     'latency, 99 %, y 1000 Hz, estimates on samples',
+    'share of a core, an arm of 7 joints 1000 Hz, estimates 250 Hz',
     'replay to a bag / rosbags reads',
 )
 """Rows of the page."""

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 
-def joint_sample(message: Any, arm: Arm) -> tuple[int, list[NDArray[np.float64]]]:
+def joint_sample(message: Any, arm: Arm) -> tuple[int, list[Any]]:
     """
     Return what `Arm.take` needs: the stamp in ns, and position, effort and perhaps velocity.
 
@@ -30,7 +30,7 @@ def joint_sample(message: Any, arm: Arm) -> tuple[int, list[NDArray[np.float64]]
             raise ConfigurationError(
                 f'{what}: expected {len(names)} numbers, one for each name, got {len(numbers)}'
             )
-        arrays.append(np.asarray(numbers, dtype=np.float64)[order])
+        arrays.append(numbers if order is None else np.asarray(numbers, dtype=np.float64)[order])
     stamp = message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec
     if stamp == 0:
         raise ConfigurationError('the header stamp is 0: nobody fills it')
@@ -38,10 +38,12 @@ def joint_sample(message: Any, arm: Arm) -> tuple[int, list[NDArray[np.float64]]
 
 
 @lru_cache(maxsize=16)  # messages of a driver have the same names
-def _order(names: tuple[str, ...], joints: tuple[str, ...]) -> NDArray[np.intp]:
-    """Return where each joint is among the names."""
+def _order(names: tuple[str, ...], joints: tuple[str, ...]) -> NDArray[np.intp] | None:
+    """Return where each joint is among the names; None for the names in their order."""
     if missing := [name for name in joints if name not in names]:
         raise ConfigurationError(
             f'a message lacks {", ".join(missing)}{suggestion(missing[0], names)}'
         )
+    if names == joints:
+        return None
     return np.array([names.index(name) for name in joints])

@@ -96,7 +96,7 @@ def test_other_joints_than_revolute_ones_with_limits(urdf):
 def test_without_noise_one_filter_is_the_kalman_filter():
     """One joint, weights fixed by rates of zero: compare with the textbook recursion."""
     h, w, r, e = 1e-3, 4.0, 1e-8, 0.01
-    bank = Bank([w], 1e-9, [1.0], (0.0, 0.0, 0.0))
+    bank = Bank([w], 1e-9, [1.0], (0.0, 0.0, 0.0), np.array([[e], [r], [0.0]]))
     bank.start(1.0, 0.0, [0.0], [[1.0]], [1.0])
     x, p = np.zeros(3), np.diag([0.0, 1.0, 1.0])
     f, q = discrete(np.eye(3, k=1), np.diag([0.0, 0.0, w]), h)
@@ -106,7 +106,7 @@ def test_without_noise_one_filter_is_the_kalman_filter():
     for _ in range(50):
         moved, u = 1e-4 * random.standard_normal(), random.standard_normal()
         y += moved
-        bank.step(h, one, np.array([moved]), np.array([r]), 0.0, np.array([u]), np.array([e]), one)
+        bank.step(h, one, np.array([moved]), 0.0, np.array([u]), one)
         x, p, before = f @ x + g * 0.5 * (before + u), f @ p @ f.T + q, u
         k = p[:, 0] / (p[0, 0] + r)
         x, p = x + k * (y - x[0]), p - np.outer(k, p[0])
@@ -119,10 +119,10 @@ def test_a_force_that_is_there_at_once_is_not_taken_for_one_that_grows():
     """The first sample of a step of d = 1: its mean over the sample, not half as much again."""
     h, seen = 1e-3, {}
     for onset in (0.0, 0.1):
-        bank = Bank([1e-9], 3.0, [1.0], (1.0, 1.0, 0.0), onset, of_position=False)
-        tiny, one = np.array([1e-16]), np.eye(1)
+        rates, tiny, one = (1.0, 1.0, 0.0), np.full((3, 1), 1e-16), np.eye(1)
+        bank = Bank([1e-9], 3.0, [1.0], rates, tiny, onset, of_position=False)
         for change in [0.0] * 20 + [h]:
-            bank.step(h, one, np.array([change]), tiny, 0.0, np.zeros(1), tiny, one)
+            bank.step(h, one, np.array([change]), 0.0, np.zeros(1), one)
         seen[onset] = float(bank.mean[2, 0])
     assert 1.3 < seen[0.0] < 1.6
     assert abs(seen[0.1] - 1.0) < 0.05

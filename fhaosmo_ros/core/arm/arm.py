@@ -19,8 +19,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Floats = NDArray[np.float64]
-MAX_GAP = 0.1
-"""Seconds without a sample, or back in time, after which the estimates begin anew."""
 RATES = 0.15, 7.0, 30.0
 """Rates (1/s) at which contact begins and ends, and its intensity changes."""
 ONSET = 0.05
@@ -144,7 +142,7 @@ class Arm:
         self._with_gravity = p['effort'] != 'gravity_compensated'
         self._delay = p['torque_delay']
         given = self._values('torque_constants')
-        self._constants = np.where(given == 1.0, known.torque_constants, given)
+        constants = np.where(given == 1.0, known.torque_constants, given)
         scale = model.torque_of_weight()
         scale = np.maximum(scale, LEAST * np.max(scale))
         self._model_variance = self._size('model_error', MODEL_ERROR * scale) ** 2
@@ -157,16 +155,15 @@ class Arm:
         least[0, told == 0.0] *= LEAST_FOUND
         most[0, told > 0.0] = told[told > 0.0]
         noise, fastest = Noise(size, least, most), FASTER * model.velocity_limits
-        self._torque_variance, position_variance, velocity_variance = noise.variance
-        self._variance = position_variance if self._of_position else velocity_variance
+        self._variance = noise.variance[1 if self._of_position else 2]
         self._samples = Samples(
-            noise, np.array([-STRONGER * strong, model.lowest - FURTHER, -fastest]),
+            noise, constants, np.array([-STRONGER * strong, model.lowest - FURTHER, -fastest]),
             np.array([STRONGER * strong, model.highest + FURTHER, fastest]), STEP * position,
-            STOPPING * strong, model.continuous, MAX_GAP, self._of_position,
+            STOPPING * strong, model.continuous, self._of_position,
         )  # fmt: skip
         self._bank = Bank(
             2.0 * DECAY * self._model_variance, DECAY, np.array(INTENSITIES) * model.weight,
-            RATES, ONSET, SINCE if self._of_position else 0.0, self._of_position,
+            RATES, noise.variance, ONSET, SINCE if self._of_position else 0.0, self._of_position,
         )  # fmt: skip
         self._rest, self._tare = np.zeros((2, n))
         self.counters: Counter[str] = Counter()
@@ -216,7 +213,7 @@ class Arm:
         """Take the present external torque for zero from now on."""
         with self._alone:
             now = self._bank.mean[2].copy()
-            self._tare += now
+            self._tare -= now
             self._bank.shift(now)
 
     def take(
@@ -241,21 +238,15 @@ class Arm:
 
         """
         with self._alone:
-            given = effort, q, self._rest if self._of_position else velocity
             self.problem = ''
-            try:
-                sample = np.array(given, dtype=np.float64).reshape(3, len(self.joints))
-            except (TypeError, ValueError):
-                return self._refuse('wrong size')  # or no numbers
-            sample[0] *= self._constants
             samples = self._samples
-            problem = samples.take(stamp, sample, self._velocity, self._bank.motion)
+            speed = self._rest if self._of_position else velocity
+            problem = samples.take(stamp, effort, q, speed, self._velocity, self._bank.motion)
             if problem:
                 return self._refuse(problem)
             if self._delay:
-                return self._go_on_late(stamp, sample)
-            effort, position, _ = sample
-            return self._go_on(stamp, effort, position, samples.h, samples.change, samples.speed)
+                return self._go_on_late(stamp)
+            return self._go_on(stamp, samples.position, samples.h, samples.change, samples.speed)
 
     def _refuse(self, problem: str) -> ArmEstimate | None:
         """Count a sample that is not used, and begin anew where that has to be."""
@@ -266,11 +257,12 @@ class Arm:
             self.counters[problem] += 1
         return None
 
-    def _go_on_late(self, stamp: int, sample: Floats) -> ArmEstimate | None:
+    def _go_on_late(self, stamp: int) -> ArmEstimate | None:
         """Go on to the time when the effort was measured, between two samples before."""
         samples, kept = self._samples, self._kept
         time, _, (way, _) = kept[-1] if kept else (0.0, None, (self._rest, None))
-        kept.append((time + samples.h, sample[1], np.array([way + samples.way, sample[2]])))
+        moved = np.array([way + samples.way, samples.velocity])
+        kept.append((time + samples.h, samples.position.copy(), moved))
         then = kept[-1][0] - self._delay
         while len(kept) > 2 and kept[1][0] <= then:
             kept.popleft()
@@ -285,33 +277,38 @@ class Arm:
             return None
         change = moved if self._of_position else speed
         stamp -= round(1e9 * self._delay)
-        return self._go_on(stamp, sample[0], q - back[0], h, change, speed)
+        return self._go_on(stamp, q - back[0], h, change, speed)
 
     def _go_on(
-        self, stamp: int, torque: Floats, q: Floats, h: float, change: Floats, speed: Floats
+        self, stamp: int, q: Floats, h: float, change: Floats, speed: Floats
     ) -> ArmEstimate | None:
         """Go on to a sample; how the joints have moved within `h` seconds is as of `Samples`."""
-        bank, before = self._bank, self._velocity
+        bank, samples, before = self._bank, self._samples, self._velocity
         if before is None or not self._of_position:
             self._sliding = speed.copy()
         elif self._calibrated:
             self._sliding = self._sliding - np.expm1(-h / SLIDING) * (speed - self._sliding)
         known = self._sliding if before is None or not self._of_position else before
-        mass, drive = self._drive(q, known, torque, self._sliding)
+        mass, coriolis, gravity = self.model.terms(q, known)
+        less = [self._tare]
+        if self._with_gravity:
+            less.append(gravity)
+        if self._calibrated:
+            # Of encoders alone, because the estimate M^-1 p would feed its own error of friction
+            # back, worst at joints of little inertia.
+            less.append(self.calibration.friction(self._sliding))
+        drive = bank.net_torque(samples.torque, known, coriolis, less)
         if before is None:
             wide = 2.0 * self._variance / (h * h if self._of_position else 1.0)
             spread = (mass * wide) @ mass.T
             bank.start(mass, drive, mass @ speed, spread, self._model_variance)
-        bank.step(
-            h, mass, change, self._variance, self._samples.vague, drive, self._torque_variance,
-            self._reach,
-        )  # fmt: skip
-        self.doubts.take(h, q, torque, bank.mean[2])
+        bank.step(h, mass, change, samples.vague, drive, self._reach)
+        self.doubts.take(h, q, samples.torque, bank.mean[2])
         if self.doubts.text and not self.doubts.payload:
             return self._refuse('doubted')
         self._velocity = speed = self.model.velocity_of(bank.mean[1])
-        if not self._samples.is_possible(2, speed):  # C^T qd grows with its square
-            self._samples.reset()
+        if not samples.is_possible(2, speed):  # C^T qd grows with its square
+            samples.reset()
             return self._refuse('diverged')
         self.counters['used'] += 1
         return self._estimate(stamp, q, speed)
@@ -335,24 +332,8 @@ class Arm:
                 shares = likely / np.sum(likely) + ELSEWHERE
             self._reach = np.tensordot(shares, reach, 1)
         link = self.model.links[int(np.argmax(self._evidence))] if self._contact or touched else ''
+        q = q.copy()  # the sample is written anew by the next one
         return ArmEstimate(stamp, q, velocity, torques, covariance, odds, self._contact, link)
-
-    def _drive(
-        self, q: Floats, velocity: Floats, torque: Floats, sliding: Floats
-    ) -> tuple[Floats, Floats]:
-        """
-        Return M, and u = torque - friction + C^T qd - g.
-
-        Friction is that of the velocity `sliding`: of encoders alone, because the estimate M^-1 p
-        would feed its own error of friction back, worst at joints of little inertia.
-        """
-        terms = self.model.terms(q, velocity)
-        drive = terms.coriolis + torque + self._tare
-        if self._calibrated:
-            drive -= self.calibration.friction(sliding)
-        if self._with_gravity:
-            drive -= terms.gravity
-        return terms.mass, drive
 
     def run(
         self, t: ArrayLike, q: ArrayLike, effort: ArrayLike, velocity: ArrayLike | None = None

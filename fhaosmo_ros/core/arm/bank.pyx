@@ -34,6 +34,8 @@ cdef class Bank:
         Of the contact filters: W is scale^2 times `shape` of `step`, and that of free motion.
     rates : three floats
         1/s, at which contact begins and ends, and at which its intensity changes.
+    variance : (3, n) array
+        Of the noise of efforts, positions and velocities, from sample to sample; may change.
     onset, since : float
         Where contact begins, d may have jumped by so many seconds of W, at any time within the
         last `since` seconds: else a force that is there at once would be taken for one that still
@@ -61,17 +63,23 @@ cdef class Bank:
     cdef double[::1] mixed, anew, likelihood
     cdef double[:, ::1] work  # S, H P and the innovation, side by side
     cdef double[:, ::1] spread, noise
+    cdef const double[:, ::1] variance
     # M and u at the sample before, and between it and the next one.
     cdef double[:, ::1] mass, middle
     cdef double[::1] drive, mean_drive
+    cdef readonly object u  # (n,), as `net_torque` has summed it up
+    cdef double[::1] net
 
     def __cinit__(
-        self, free_intensity, double decay, scales, rates, double onset=0.0, double since=0.0,
-        bint of_position=True,
+        self, free_intensity, double decay, scales, rates, variance, double onset=0.0,
+        double since=0.0, bint of_position=True,
     ):
         cdef int n = len(free_intensity), m = len(scales) + 1
         self.joints, self.filters, self.of_position = n, m, of_position
         self.free = np.array(free_intensity, dtype=np.float64)
+        self.variance = variance
+        if variance.shape != (3, n):
+            raise ValueError(f'expected variances of {n} joints')
         self.scales = np.square([0.0, *scales])
         self.decay, (self.begin, self.end, self.change) = decay, rates
         self.onset, self.since = onset, fmax(since, 1e-15)
@@ -83,7 +91,8 @@ cdef class Bank:
         self.weights, self.mixed, self.anew, self.likelihood = np.zeros((4, m))
         self.w = self.weights
         self.mass, self.middle = np.zeros((2, n, n))
-        self.drive, self.mean_drive = np.zeros((2, n))
+        self.u = np.zeros(n)
+        self.net, (self.drive, self.mean_drive) = self.u, np.zeros((2, n))
         self.start(0.0, 0.0, np.zeros(n), np.zeros((n, n)), np.zeros(n))
 
     def start(self, mass, drive, momentum, momentum_covariance, torque_variance):
@@ -111,10 +120,31 @@ cdef class Bank:
         np.asarray(self.s)[:, 0, 2 * self.joints :] -= torque
         self.mean[2] -= torque
 
+    def net_torque(
+        self, const double[::1] torque, const double[::1] velocity,
+        const double[:, :] coriolis, less,
+    ):
+        """
+        Return u = torque + C^T qd - all that is in `less`: gravity, say, and friction.
+
+        The array is written anew by the next call.
+        """
+        cdef int i, k, n = self.joints
+        cdef const double[::1] known
+        if not n == torque.shape[0] == velocity.shape[0] == coriolis.shape[0] == coriolis.shape[1]:
+            raise ValueError(f'expected arrays of {n} joints')
+        for i in range(n):
+            self.net[i] = torque[i]
+            for k in range(n):
+                self.net[i] += coriolis[k, i] * velocity[k]
+        for known in less:
+            for i in range(n):
+                self.net[i] -= known[i]
+        return self.u
+
     def step(
-        self, double h, const double[:, ::1] mass, const double[::1] change,
-        const double[::1] variance, double vague, const double[::1] drive,
-        const double[::1] torque_variance, const double[:, ::1] shape,
+        self, double h, const double[:, :] mass, const double[::1] change, double vague,
+        const double[::1] drive, const double[:, ::1] shape,
     ):
         """
         Go on to the next sample.
@@ -127,23 +157,20 @@ cdef class Bank:
             M at this sample.
         change : (n,) array
             q - q before, so that Y has changed by M times that; or qd, where p is measured.
-        variance : (n,) array
-            Of the noise of `change`.
         vague : float
             Share of `change` that is not known, the same for all joints.
         drive : (n,) array
             u at this sample: torque + C^T qd - g.
-        torque_variance : (n,) array
-            Of u, from sample to sample.
         shape : (n, n) array
             Sum of J^T J over the links, by their shares: how forces act on the joints.
 
         """
         cdef int i, j, k, n = self.joints
         cdef double moved
+        cdef const double[::1] variance = self.variance[1 if self.of_position else 2]
         if not (
-            n == mass.shape[0] == mass.shape[1] == change.shape[0] == variance.shape[0]
-            == drive.shape[0] == torque_variance.shape[0] == shape.shape[0] == shape.shape[1]
+            n == mass.shape[0] == mass.shape[1] == change.shape[0] == drive.shape[0]
+            == shape.shape[0] == shape.shape[1]
         ):
             raise ValueError(f'expected arrays of {n} joints')
         for i in range(n):
@@ -166,7 +193,7 @@ cdef class Bank:
                 self.noise[i, j] = moved
         with nogil:
             self.mix(h)
-            self.predict(h, torque_variance, shape)
+            self.predict(h, shape)
             self.correct()
             self.weigh()
 
@@ -216,9 +243,7 @@ cdef class Bank:
             add_square(&self.s[j, 0, 0], -1.0, size)
             add(&self.s[j, 0, 0], 1.0, &self.average[0], 2 * n)
 
-    cdef VECTORISED predict(
-        self, double h, const double[::1] torque_variance, const double[:, ::1] shape
-    ) noexcept nogil:
+    cdef VECTORISED predict(self, double h, const double[:, ::1] shape) noexcept nogil:
         """
         Bring all filters to the time of the sample.
 
@@ -250,7 +275,7 @@ cdef class Bank:
                     self.s[j, 0, a * n + i] += push[a] * self.mean_drive[i]
                     for b in range(3):
                         row = &self.s[j, 1 + a * n + i, b * n]
-                        own = push[a] * push[b] * torque_variance[i]
+                        own = push[a] * push[b] * self.variance[0, i]
                         row[i] += own + free[3 * a + b] * self.free[i]
                         add(row, contact[3 * a + b], &shape[i, 0], n)
 

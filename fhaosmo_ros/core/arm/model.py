@@ -25,7 +25,7 @@ class Terms(NamedTuple):
     """The equation M(q) qdd + C(q, qd) qd + g(q) = torque at one posture and velocity."""
 
     mass: Floats  # (n, n) M, kg m^2 (kg for a prismatic joint)
-    coriolis: Floats  # (n,) C(q, qd)^T qd, N m: what drives p = M qd beside torque and gravity
+    coriolis: Floats  # (n, n) C, N m s: C^T qd drives p = M qd beside torque and gravity
     gravity: Floats  # (n,) g, N m
 
 
@@ -102,6 +102,7 @@ class ArmModel:
         first = {f.parentJoint: str(f.name) for f in reversed(bodies)}
         self.links = tuple(first[k] for k in range(1, model.njoints))
         self.continuous = np.array([size == 2 for size in list(model.nqs)[1:]])
+        self._turns = bool(self.continuous.any())
         # A URDF that says nothing of a limit, or zero, means none.
         at = np.array(model.idx_qs[1:])
         lowest, highest = model.lowerPositionLimit[at], model.upperPositionLimit[at]
@@ -159,12 +160,12 @@ class ArmModel:
 
     def _configuration(self, q: Floats) -> Floats:
         """Return q as Pinocchio has it: cosine and sine of a continuous joint's angle."""
-        return np.asarray(pin.integrate(self._model, self._zero, q))
+        return pin.integrate(self._model, self._zero, q) if self._turns else q
 
     def terms(self, q: Floats, velocity: Floats) -> Terms:
         """Return the terms at q (n,) and its velocity (n,)."""
         at = self._model, self._data, self._configuration(q)
-        coriolis = velocity @ pin.computeCoriolisMatrix(*at, velocity)
+        coriolis = pin.computeCoriolisMatrix(*at, velocity).copy()
         gravity = pin.computeGeneralizedGravity(*at).copy()
         return Terms(pin.crba(*at).copy(), coriolis, gravity)
 

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """What samples of an arm say by themselves: which can be used, their noise, and their time."""
 
+from contextlib import suppress
+
 from libc.math cimport fabs, floor, fmax, fmin, INFINITY, isnan, M_PI, NAN, sqrt
 
 import numpy as np
@@ -23,6 +25,8 @@ cdef int MOST_REPEATS = 10
 # deviations at most.
 cdef int FIRST_LEARNT = 10, LONGEST_LEARNT = 1000
 cdef double LARGEST = 9.0
+# Seconds without a sample, or back in time, after which one is a first one.
+cdef double MAX_GAP = 0.1
 
 
 FAULTS = ('too strong', 'beyond limits', 'too fast')
@@ -187,6 +191,8 @@ cdef class Samples:
     Parameters
     ----------
     noise : Noise
+    constants : (n,) array
+        Torque for a unit of effort.
     lowest, highest : (3, n) array
         What an arm can have.
     step : (n,) array
@@ -195,8 +201,6 @@ cdef class Samples:
         Torques by which no arm is stopped between two samples.
     turning : (n,) array of bool
         Joints whose angle has no end.
-    longest : float
-        Seconds without a sample, or back in time, after which one is a first one.
     of_position : bool
         True if positions say how the joints have moved, False if velocities do.
 
@@ -204,29 +208,33 @@ cdef class Samples:
 
     cdef readonly double h, vague  # time in which the joints moved, and share that is not known
     cdef readonly object way, change, speed  # (n,): moved, what `Bank.step` takes, velocities
+    # The latest sample, and its rows: written anew by the next one.
+    cdef readonly object sample, torque, position, velocity
     cdef readonly Noise noise
     cdef readonly Clock clock
     cdef double[:, ::1] lowest, highest
-    cdef double[::1] step, stopping, rest, position, moved, rate
+    cdef double[:, ::1] now
+    cdef double[::1] constants, step, stopping, rest, before, moved, rate
     cdef unsigned char[::1] turning
-    cdef double longest
     cdef bint of_position, begun, still
     cdef int repeats  # samples in a row that a driver has published once more
     cdef long long time, newest  # of the latest sample that counts, and of any
 
     def __cinit__(
-        self, Noise noise not None, lowest, highest, step, stopping, turning, double longest,
+        self, Noise noise not None, constants, lowest, highest, step, stopping, turning,
         bint of_position,
     ):
         cdef Py_ssize_t n = len(step)
-        given = noise.variance, lowest, highest, step, stopping, turning
-        if [*map(np.shape, given)] != [(3, n)] * 3 + [(n,)] * 3:
+        given = noise.variance, lowest, highest, constants, step, stopping, turning
+        if [*map(np.shape, given)] != [(3, n)] * 3 + [(n,)] * 4:
             raise ValueError(f'expected arrays of {n} joints')
         self.noise, self.clock = noise, Clock()
-        self.longest, self.of_position = longest, of_position
+        self.of_position, self.constants = of_position, np.array(constants, dtype=np.float64)
+        self.now = self.sample = np.zeros((3, n))
+        self.torque, self.position, self.velocity = self.sample
         self.lowest, self.highest, self.step, self.stopping = lowest, highest, step, stopping
         self.turning = np.array(turning, dtype=np.uint8)
-        self.rest, self.position, self.moved, self.rate = np.zeros((4, n))
+        self.rest, self.before, self.moved, self.rate = np.zeros((4, n))
         self.way, self.speed = np.asarray(self.moved), np.asarray(self.rate)
         self.change = self.way if of_position else self.speed
         self.newest = -(1 << 62)
@@ -249,9 +257,7 @@ cdef class Samples:
                 return False
         return True
 
-    def take(
-        self, long long time, const double[:, ::1] sample, velocity, const double[::1] motion
-    ):
+    def take(self, long long time, effort, position, velocity, known, const double[::1] motion):
         """
         Go on to a sample.
 
@@ -259,71 +265,88 @@ cdef class Samples:
         ----------
         time : int
             ns.
-        sample : (3, n) array
-        velocity : (n,) array or None
-            Estimated at the sample before; None if it is not known yet.
+        effort, position, velocity : (n,) array
+        known : (n,) array or None
+            Velocity estimated at the sample before; None if it is not known yet.
         motion : (n,) array
             M times `change` of the sample before.
 
         Returns
         -------
         str
-            Empty if the sample can be used, else why not: one of `FAULTS` or 'not finite', 'not
-            newer', 'standing still', 'repeated' (a joint that moves by more than a step of its
-            encoder shows it), 'jumped', after which the next sample is the first; and the first
-            one itself, 'first', 'clock set back' or 'restarts' (after a gap).
+            Empty if the sample can be used, else why not: one of `FAULTS` or 'wrong size', 'not
+            finite', 'not newer', 'standing still', 'repeated' (a joint that moves by more than a
+            step of its encoder shows it), 'jumped', after which the next sample is the first; and
+            the first one itself, 'first', 'clock set back' or 'restarts' (after a gap).
 
         """
-        cdef const double[::1] known = self.rest if velocity is None else velocity
+        cdef const double[::1] likely = self.rest if known is None else known
         cdef int i, k, n = self.step.shape[0]
         cdef double over  # what divides `motion` to have p
         cdef bint moves = False, repeated = False, back
-        if sample.shape[0] != 3 or not (
-            n == sample.shape[1] == known.shape[0] == motion.shape[0]
-        ):
+        if not n == likely.shape[0] == motion.shape[0]:
             raise ValueError(f'expected arrays of {n} joints')
+        given = effort, position, velocity
         for i in range(3):
-            if not self.is_possible(i, sample[i]):
-                return FAULTS[i] if np.isfinite(sample).all() else 'not finite'
-        back = time < self.newest - self.longest * 1e9
+            if not self.read(i, given[i]):
+                return 'wrong size'
+        for i in range(3):
+            if not self.is_possible(i, self.now[i]):
+                return FAULTS[i] if np.isfinite(self.sample).all() else 'not finite'
+        back = time < self.newest - MAX_GAP * 1e9
         if time <= self.newest and not back:
             return 'not newer'
         self.newest = time
         if back or not self.begun:
-            return self.begin(time, sample, 'clock set back' if back else 'first')
+            return self.begin(time, 'clock set back' if back else 'first')
         over = self.h if self.of_position else 1.0
         self.h = (time - self.time) * 1e-9
         for k in range(n):
-            self.moved[k] = sample[1, k] - self.position[k]
+            self.moved[k] = self.now[1, k] - self.before[k]
             if self.turning[k]:  # the shorter way
                 self.moved[k] -= 2.0 * M_PI * floor(self.moved[k] / (2.0 * M_PI) + 0.5)
             moves = moves or self.moved[k] != 0.0
         if moves:
             self.still, self.repeats = False, 0
-        elif velocity is not None:  # to the bit, and all joints at once
+        elif known is not None:  # to the bit, and all joints at once
             for k in range(n):
-                repeated = repeated or fabs(known[k]) * self.h > self.step[k]
+                repeated = repeated or fabs(likely[k]) * self.h > self.step[k]
                 self.still = self.still or fabs(motion[k]) > self.stopping[k] * self.h * over
         if repeated and self.repeats < MOST_REPEATS:
             self.repeats += 1
             return 'repeated'
         if self.still:
             return 'standing still'
-        if self.h > self.longest:
-            return self.begin(time, sample, 'restarts')
-        self.h = self.clock.interval(self.h, self.moved, known, self.noise.now[1])
+        if self.h > MAX_GAP:
+            return self.begin(time, 'restarts')
+        self.h = self.clock.interval(self.h, self.moved, likely, self.noise.now[1])
         for k in range(n):
             if fabs(self.moved[k]) > self.highest[2, k] * self.h + OFF * self.step[k]:
                 self.reset()
                 return 'jumped'
-            self.rate[k] = self.moved[k] / self.h if self.of_position else sample[2, k]
+            self.rate[k] = self.moved[k] / self.h if self.of_position else self.now[2, k]
         self.vague = self.clock.vague if self.of_position else 0.0
-        self.noise.take(sample)
-        self.time, self.position[:] = time, sample[1]
+        self.noise.take(self.now)
+        self.time, self.before[:] = time, self.now[1]
         return ''
 
-    cdef str begin(self, long long time, const double[:, ::1] sample, str problem):
+    cdef bint read(self, int row, numbers) except -1:
+        """Take a row of a sample; return False if it has another size, or is not of numbers."""
+        cdef const double[:] values = None
+        cdef int k
+        try:
+            values = numbers
+        except (TypeError, ValueError):  # no array of doubles, as library users may have them
+            with suppress(TypeError, ValueError):
+                values = np.asarray(numbers, dtype=np.float64)
+        if values is None or values.shape[0] != self.step.shape[0]:
+            return False
+        for k in range(values.shape[0]):
+            self.now[row, k] = values[k] * (1.0 if row else self.constants[k])
+        return True
+
+    cdef str begin(self, long long time, str problem):
         """Take a sample as the first one, and return why it is that."""
         self.reset()
-        self.begun, self.time, self.position[:] = True, time, sample[1]
+        self.begun, self.time, self.before[:] = True, time, self.now[1]
         return problem
