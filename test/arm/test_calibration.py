@@ -115,7 +115,7 @@ def test_the_file_gives_back_what_was_written_and_others_are_refused(found):
             Calibration.loads(text)
 
 
-def test_commands_calibrate_and_replay_a_bag(tmp_path):
+def test_commands_calibrate_check_and_replay_a_bag(tmp_path, capsys):
     messages = [('/robot_description', TEXT, 1, files.serialise(TEXT, data=URDF))]
     for t, q, torque in zip(*recorded(duration=15.0), strict=True):
         stamp = 10**9 + round(t * 1e9)
@@ -124,8 +124,16 @@ def test_commands_calibrate_and_replay_a_bag(tmp_path):
     bag = files.write(tmp_path / 'free', messages)
     file, table = tmp_path / 'three.yaml', tmp_path / 'torque.csv'
     assert calibrate.main(['--bag', str(bag), '-o', str(file)]) == 0
+    held_out = capsys.readouterr().out
+    known = ['-p', f'calibration_file:={file}']
+    assert calibrate.main(['--bag', str(bag), '--check', *known]) == 0
+    ratios = [
+        [float(line.split()[-1]) for line in said.splitlines() if line.startswith(JOINTS)]
+        for said in (held_out, capsys.readouterr().out)
+    ]
+    np.testing.assert_allclose(*ratios, atol=0.1)
     assert (tmp_path / 'three.png').stat().st_size > 10_000
-    assert replay.main([str(bag), '-o', str(table), '-p', f'calibration_file:={file}']) == 0
+    assert replay.main([str(bag), '-o', str(table), *known]) == 0
     rows = np.genfromtxt(table, delimiter=',', skip_header=1, usecols=range(7))
     assert np.abs(rows[500:, 1:4]).mean() < 0.5
     assert Calibration.loads(file.read_text()).log_odds >= calibrate.LEAST

@@ -135,6 +135,18 @@ def identify(
     )  # fmt: skip
 
 
+def unexplained(
+    model: ArmModel, t: Floats, q: Floats, effort: Floats, calibration: Calibration
+) -> tuple[Floats, Floats]:
+    """Return the RMS of the torque that the URDF leaves, `model`, and a calibration, (n,) each."""
+    constants = calibration.torque_constants
+    alone, calibrated = (
+        _rms(_Regression(model, t, q, effort, known, constants).unexplained)
+        for known in (Calibration.of_urdf(model), calibration)
+    )
+    return alone, calibrated
+
+
 def payload_of_motion(
     model: ArmModel, t: Floats, q: Floats, effort: Floats, calibration: Calibration
 ) -> tuple[Floats, Floats, Floats]:

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from fhaosmo_ros.core.arm.arm import Arm
-from fhaosmo_ros.core.arm.identification import identify, payload_of_motion
-from fhaosmo_ros.core.arm.model import Floats
+from fhaosmo_ros.core.arm.identification import identify, payload_of_motion, unexplained
+from fhaosmo_ros.core.arm.model import ArmModel, Floats
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.stop_signals import Stop
 from fhaosmo_ros.tools.arm import recording
@@ -34,9 +34,14 @@ def main(argv: list[str] | None = None) -> int:
         '-o', '--output', type=Path, default=Path('calibration.yaml'), metavar='FILE',
         help='file to write, with a figure beside it (default: %(default)s)',
     )  # fmt: skip
-    parser.add_argument(
+    known = parser.add_mutually_exclusive_group()
+    known.add_argument(
         '--payload', action='store_true',
         help='find the payload only; everything else is that of calibration_file',
+    )  # fmt: skip
+    known.add_argument(
+        '--check', action='store_true',
+        help='find nothing; say how well calibration_file explains this bag, of another day say',
     )  # fmt: skip
     recording.add_arm_options(parser)
     return run_command(parser, argv, _calibrate)
@@ -44,13 +49,15 @@ def main(argv: list[str] | None = None) -> int:
 
 def _calibrate(arguments: argparse.Namespace, stop: Stop) -> None:
     values = recording.arm_parameters(arguments) | {'measurement': 'position'}
-    if arguments.payload and not values.get('calibration_file'):
+    if (arguments.payload or arguments.check) and not values.get('calibration_file'):
         raise ConfigurationError(
-            '--payload: expected -p calibration_file:=FILE of the arm without payload, got none'
+            '--payload, --check: expected -p calibration_file:=FILE of this arm, got none'
         )
     with stop.raising(), BagReader(arguments.bag) as reader:
         urdf = recording.description(reader, arguments)
-        unknown = {'payload': [0.0] * 4} if arguments.payload else {'calibration_file': ''}
+        unknown: dict[str, Any] = {'calibration_file': ''}
+        if arguments.payload or arguments.check:
+            unknown = {'payload': [0.0] * 4} if arguments.payload else {}
         arm = Arm(urdf, values | unknown)
         stamps, rows = zip(*recording.joint_samples(reader, arguments.topic, arm), strict=True)
         when, samples = np.array(stamps), np.array(rows)
@@ -60,6 +67,10 @@ def _calibrate(arguments: argparse.Namespace, stop: Stop) -> None:
         torque = effort
         if arm.parameters['effort'] == 'gravity_compensated':
             torque = effort + np.array([arm.model.terms(row, 0.0 * row).gravity for row in q])
+        if arguments.check:
+            left = unexplained(ArmModel(urdf, joints=arm.joints), t, q, torque, arm.calibration)
+            print(_table(arm.joints, 'URDF', 'calibrated', *left))
+            return
         if arguments.payload:
             payload, *left = payload_of_motion(arm.model, t, q, torque, arm.calibration)
             print(_table(arm.joints, 'without', 'with payload', *left))
