@@ -47,10 +47,10 @@ STOPPING = 2.0
 """Times the same, by which no arm is stopped between two samples."""
 DAMPING = 0.02
 """Singular value of a frame's Jacobian, m, below which a force along it is damped."""
-LOOK, KEEP = 0.01, 0.96
+LOOK, LOOK_CLOSELY, KEEP = 0.05, 0.01, 0.96
 """
-Seconds between two looks at the posture and, in contact, at the link; and how much of what was
-known of the link still counts at the next one, since a contact may slide.
+Seconds between two looks at the posture, and in contact at it and the link; and how much of what
+was known of the link still counts at the next one, since a contact may slide.
 """
 ELSEWHERE = 0.02
 """By so much forces on each link still count in a contact, however sure another link is."""
@@ -318,7 +318,8 @@ class Arm:
         bank, touched = self._bank, self._contact
         odds, torques, covariance = bank.log_odds, bank.mean[2].copy(), bank.covariance.copy()
         self._contact = odds > (0.0 if touched else self._threshold)
-        if self._contact != touched or stamp - self._looked >= LOOK * 1e9:
+        every = LOOK_CLOSELY if self._contact else LOOK
+        if self._contact != touched or stamp - self._looked >= every * 1e9:
             self._looked = stamp
             reach, shares = self.model.reach_of_links(q), np.ones(len(q))
             if self._contact:
@@ -330,7 +331,7 @@ class Arm:
                 self._evidence = KEEP * self._evidence + own if touched else own
                 likely = np.exp(self._evidence - np.max(self._evidence))
                 shares = likely / np.sum(likely) + ELSEWHERE
-            self._reach = np.tensordot(shares, reach, 1)
+            self._reach = (shares @ reach.reshape(len(q), -1)).reshape(reach.shape[1:])
         link = self.model.links[int(np.argmax(self._evidence))] if self._contact or touched else ''
         q = q.copy()  # the sample is written anew by the next one
         return ArmEstimate(stamp, q, velocity, torques, covariance, odds, self._contact, link)

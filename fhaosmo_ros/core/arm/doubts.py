@@ -10,7 +10,7 @@ from typing import Any
 from fhaosmo_ros.core.arm.model import ArmModel, Floats
 import numpy as np
 
-EVERY = 0.05
+EVERY = 0.1
 """Seconds between two rows."""
 MEMORY = 20.0
 """Seconds after which a row counts 1/e."""
