@@ -2,7 +2,7 @@
 """
 What a calibration of one day explains of another: motor currents of a UR10e that others recorded.
 
-The folder has `dataset_ur10e`, URDF and parameters of github.com/shamilmamedov/dynamic_calibration.
+The folder has the files on that robot of shamilmamedov/dynamic_calibration (GitHub).
 """
 
 import argparse
