@@ -188,6 +188,19 @@ def test_a_y_that_is_sampled_at_uneven_times_is_not_noisy(seed):
     assert rms((found.unknown_input - d)[t > 0.5 * t[-1]]) < 0.05 * rms(d)
 
 
+@pytest.mark.parametrize('seed', [0, 1, 2])
+def test_samples_that_wait_for_a_host_that_hangs_are_evenly_spaced(seed):
+    """It hangs for up to ten periods at one of fifty samples, and stamps at once what waits."""
+    random, t = np.random.default_rng(seed), PERIOD * np.arange(8001)
+    hangs = np.where(random.random(8001) < 0.02, random.uniform(0.5, 10.0, 8001), 0.0)
+    late = hangs + 0.02 * random.standard_exponential(8001)
+    stamps = np.maximum.accumulate(t + PERIOD * late) + 1e-6 * np.arange(8001)
+    model = {'order': 2, 'phi': ['0', '-0.8*z2']}
+    truth = Plant(**model, disturbance_omega=3.0).simulate(t)
+    found = estimated(model | SELF_TUNING, stamps, truth.y)
+    assert rms((found.unknown_input - truth.unknown_input)[4000:]) < 0.1 * rms(truth.unknown_input)
+
+
 @pytest.mark.parametrize('noise', [0.0, 1e-5])
 @pytest.mark.parametrize('file', ['self_tuning', 'models/paper_plant'])
 def test_a_sample_that_its_host_stamps_late_is_not_rejected(case, file, noise):

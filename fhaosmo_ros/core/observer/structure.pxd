@@ -50,6 +50,7 @@ cdef struct Memory:
     # What those remember that judge samples.
     double interval  # the last one between two samples, likely or not (s); 0: none yet
     double since  # time from the last sample that was used to the last one (s)
+    double behind  # by how much the stamp of the last sample that was used was late (s)
 
 
 cdef class Structure:
@@ -74,6 +75,7 @@ cdef class Structure:
     cdef Row trial_covariance[MOST_LEVELS]
     cdef double innovation[MOST_LEVELS]  # eps_i = m_i - z_hat_i after the latest sample
     cdef double loss, gradient  # L and dL/dgamma
+    cdef double passed, late  # time that a step takes for passed, and how late its stamp is (s)
     cdef public int word  # status word of the latest sample
     cdef bint busy  # a run without the GIL is under way
 

@@ -104,7 +104,7 @@ cdef class Structure:
         cdef int word = 0
         self.memory.offset = 0.0
         if isfinite(HEADROOM * y):
-            self.memory.y, self.memory.pending = y, 0.0
+            self.memory.y, self.memory.pending, self.memory.behind = y, 0.0, 0.0
             if self.from_measurement:
                 self.level[0].z_hat = y
         else:
@@ -119,7 +119,7 @@ cdef class Structure:
         """
         cdef Memory* memory = &self.memory
         cdef int word = 0, i
-        cdef double measured = y, whole, mean, zero = 0.0
+        cdef double measured = y, elapsed, mean, zero = 0.0
         y -= memory.offset  # D 23
         if not isfinite(HEADROOM * y):
             word |= REJECTED_MEASUREMENT
@@ -129,9 +129,12 @@ cdef class Structure:
         if not (h > 0.0 and isfinite(HEADROOM * h)):
             word |= REJECTED_PERIOD
         if not word:
-            whole = h + memory.pending
+            elapsed = h + memory.pending
+            if elapsed + memory.behind <= 0.0:
+                memory.behind = 0.0
+            self.passed, self.late = elapsed + memory.behind, 0.0
             copy_levels(self.levels, self.level, self.before)
-            self.advance(y, whole, u)
+            self.advance(y, self.passed, u)
             for i in range(self.levels):  # a difference of equals is 0, or NaN if not finite
                 zero += HEADROOM * self.level[i].z_hat - HEADROOM * self.level[i].z_hat
                 zero += HEADROOM * self.level[i].z_tilde - HEADROOM * self.level[i].z_tilde
@@ -140,25 +143,25 @@ cdef class Structure:
                 copy_levels(self.levels, self.before, self.level)
                 # Nothing of the sample may make the next step fail as well: not its time, and not
                 # the y at the interval's beginning, which is what fails explicitly.
-                memory.pending = 0.0
+                memory.pending = memory.behind = 0.0
                 if not self.implicit:
                     memory.y = y
                 self.fail(y)
             elif memory.beyond > LOST_SAMPLES and self.jump(u):
-                memory.pending = whole
+                memory.pending = elapsed
                 word = REJECTED_SPIKE | JUMPED
             elif memory.beyond > LOST_SAMPLES:
                 self.restart(measured)
                 word = DIVERGED
             elif memory.beyond > 0.0:
                 copy_levels(self.levels, self.before, self.level)
-                memory.pending = whole
+                memory.pending = elapsed
                 word = REJECTED_SPIKE
             else:
-                word = self.accept(y, whole)
-                memory.y, memory.pending = y, 0.0
-                mean = memory.period if memory.period > 0.0 else whole
-                memory.period = mean + FOLLOWING * (min(whole, 2.0 * mean) - mean)
+                word = self.accept(y, self.passed)
+                memory.y, memory.pending, memory.behind = y, 0.0, self.late
+                mean = memory.period if memory.period > 0.0 else self.passed
+                memory.period = mean + FOLLOWING * (min(self.passed, 2.0 * mean) - mean)
         if word & (REJECTED_MEASUREMENT | REJECTED_INPUT) and not word & REJECTED_PERIOD:
             memory.pending += h
         return word | self.measure(memory.y)
@@ -189,7 +192,7 @@ cdef class Structure:
         Return how much longer the interval before a sample is than the one before that.
 
         By as much may a host that was busy have stamped it late. `h` is the time since the last
-        sample that was used; called once for each sample.
+        sample that was used, by their stamps; called once for each sample.
         """
         cdef Memory* memory = &self.memory
         cdef double interval = h - memory.since if memory.beyond > 0.0 else h

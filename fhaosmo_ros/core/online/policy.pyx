@@ -617,7 +617,9 @@ cdef class Policy:
                     record.write(structure, k, self.take(stamps[k], y[k]))
                     if self.settings.to_now:
                         self.carry(&present[k, 0])
-                    times[k] = self.course.latest
+                    times[k] = self.course.latest - <long long>(
+                        structure.memory.behind / NANOSECONDS
+                    )
                     memcpy(&acting[k, 0], self.acting, m * sizeof(double))
         finally:
             structure.busy = False

@@ -99,6 +99,7 @@ cdef struct Shared:
     int since_mark  # samples since `score_before[0]`, and WINDOW more from the second one on
     double unsettled  # time since covariances began to move (s)
     double steady_period  # interval that they are those of (s)
+    double usual_interval  # between samples that were not stamped late (s)
     double flow_period  # interval that the flow is that of (s)
     double first_noise  # variance of the noise when the members began
     double roughness  # short mean of the squared differences of y, over their usual size

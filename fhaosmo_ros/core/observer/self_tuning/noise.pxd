@@ -20,5 +20,6 @@ cdef void follow_differences(Members* m, double y, double h) noexcept nogil
 cdef void follow_stamps(Members* m, double change) noexcept nogil
 cdef VECTORISED fill_noise(Members* m) noexcept nogil
 cdef VECTORISED find_knowing(Members* m, bint unlikely_before) noexcept nogil
+cdef bint is_even(Members* m) noexcept nogil
 cdef bint is_likely(Members* m, double gate, double late) noexcept nogil
 cdef VECTORISED follow_noise(Members* m) noexcept nogil

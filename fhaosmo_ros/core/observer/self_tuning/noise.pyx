@@ -119,6 +119,16 @@ cdef double bound_of_noise(Members* m, int colour, int order) noexcept nogil:
     return fmin(m.rough[0][colour][order], m.rough[1][colour][order])
 
 
+cdef bint is_even(Members* m) noexcept nogil:
+    """Return True if y moves as if its samples were evenly spaced, rather than at their stamps."""
+    cdef double even = INFINITY, by_stamps = INFINITY
+    cdef int p
+    for p in range(1, m.n + 2):
+        even = fmin(even, m.rough[0][0][p])
+        by_stamps = fmin(by_stamps, m.rough[1][0][p])
+    return even < by_stamps
+
+
 cdef double usual_speed(Members* m) noexcept nogil:
     """Return the mean square of the speed of y of late, by its steps."""
     return 2.0 * m.rough[0][0][1] / (m.shared.steady_period * m.shared.steady_period)

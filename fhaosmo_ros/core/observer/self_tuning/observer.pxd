@@ -26,6 +26,10 @@ cdef class SelfTuning(Structure):
     cdef void begin_afresh(self) noexcept nogil
     # Parts of a step.
     cdef void step_members(self, double y, double h, const double* u) noexcept nogil
+    cdef void look(self, double y, double h, const double* u) noexcept nogil
+    cdef bint is_stamped_late(
+        self, double y, double h, const double* u, double gate
+    ) noexcept nogil
     cdef void follow_period(self, double h, bint same) noexcept nogil
     cdef void carry_flow(self, double h, const double* u, bint same) noexcept nogil
     cdef void pass_over(self) noexcept nogil

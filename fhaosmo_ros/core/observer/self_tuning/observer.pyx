@@ -18,7 +18,7 @@ from fhaosmo_ros.core.observer.self_tuning.members cimport (
 )
 from fhaosmo_ros.core.observer.self_tuning.noise cimport (
     APART, FADED, ROUNDED, STEADY, bound_of_noise, fill_noise, find_knowing, follow_differences,
-    follow_noise, follow_quantum, follow_stamps, is_likely, rounding
+    follow_noise, follow_quantum, follow_stamps, is_even, is_likely, rounding
 )
 from fhaosmo_ros.core.observer.self_tuning.start cimport gather
 from fhaosmo_ros.core.observer.self_tuning.weights cimport (
@@ -159,6 +159,7 @@ cdef class SelfTuning(Structure):
         cdef int n = self.order, i, j, g
         cdef double size, z, a
         memory.pending = memory.offset = memory.watched = memory.drift = memory.beyond = 0.0
+        memory.behind = 0.0
         shared.unsettled = shared.growing = shared.recent = 0.0
         self.level[0].z_hat = memory.y = y
         if not self.has_begun():
@@ -222,47 +223,37 @@ cdef class SelfTuning(Structure):
         cdef Sample* sample = &w.sample
         cdef Memory* memory = &self.memory
         cdef double mean[MOST_STATES]
-        cdef double expected, since = 0.0, speed, change, late
-        cdef bint goes_on, likely, begins, jumped, rough, same
+        cdef double expected, since = 0.0, speed, change, late, gate
+        cdef bint goes_on, likely, begins, jumped, rough, even
         cdef int i, since_jump = 0
         sample.quanta = rounding(m)
         if choose_members(m, sample.quanta):
             weigh(m)
-        change = self.follow_interval(h)
+        change = self.follow_interval(h - memory.behind)
         follow_differences(m, y, memory.interval)
         follow_stamps(m, change)
-        same = fabs(h - shared.flow_period) <= EXACT * shared.flow_period
-        self.carry_flow(h, u, same)
-        speed = (self.prediction.z[0] - self.level[0].z_hat) / h
-        shared.of_stamps = shared.jitter * speed * speed
-        sample.uneven += fmax(shared.jitter, sample.irregular) * speed * speed
-        late = fabs(speed * change) if memory.beyond == 0.0 else 0.0
-        fill_noise(m)
-        self.follow_period(h, same)
-        rough = sample.roughness > HUBER * HUBER
-        if memory.beyond > 0.0 or shared.recent > 0.0 or sample.quanta > 0.0:
-            shared.moving = HALF
-        if sample.quanta > 0.0:  # P depends on the samples
-            shared.unsettled = 0.0
-        w.first, w.last = HALF - shared.moving, min(HALF + shared.moving, shared.active)
-        sample.off = y - self.prediction.z[0]
-        # A sample that is not likely changes no member: what it makes of them stands apart.
-        for i in range(self.levels):
-            mean[i] = self.level[i].z_hat
-        predict_states(m, h, mean, self.prediction.z)
-        expect(m, h, y)
-        find_knowing(m, memory.beyond > 0.0)
-        expected = w.believed[shared.likeliest] * w.noise[shared.likeliest]
-        sample.floor = fmax(sample.quanta, EXACT * EXACT * m.rough[0][0][1])
+        even, rough = is_even(m), sample.roughness > HUBER * HUBER
         sample.average = fmin(shared.samples, NOISE_SAMPLES)
-        sample.kept = exp(-h / self.forgetting if self.forgetting > 0.0 else -1.0 / MEMORY)
+        self.look(y, h, u)
+        speed = (self.prediction.z[0] - self.level[0].z_hat) / h
+        late = fabs(speed * change) if memory.beyond == 0.0 and not even else 0.0
+        sample.uneven += fmax(shared.jitter, sample.irregular) * speed * speed
+        sample.floor = fmax(sample.quanta, EXACT * EXACT * m.rough[0][0][1])
         shared.samples = <int>sample.average + 1
-        begins = has_jumped(m, memory.beyond)
         goes_on = (
             memory.beyond > 0.0 and copysign(1.0, sample.off) == shared.far_sign
             and not rough and shared.roughness < HUBER
         )
-        likely = is_likely(m, HUBER if goes_on else GATE, late)
+        gate = HUBER if goes_on else GATE
+        likely = is_likely(m, gate, late) or (even and self.is_stamped_late(y, h, u, gate))
+        if likely and memory.beyond == 0.0:
+            shared.usual_interval += (
+                fmin(self.passed, 2.0 * shared.usual_interval) - shared.usual_interval
+            ) / sample.average
+        begins = has_jumped(m, memory.beyond)
+        expected = w.believed[shared.likeliest] * w.noise[shared.likeliest]
+        for i in range(self.levels):
+            mean[i] = self.level[i].z_hat
         shared.recent = fmax(shared.recent - 1.0, 0.0)
         begins = begins and not likely
         jumped = begins or (shared.recent > 0.0 and not rough)
@@ -299,6 +290,56 @@ cdef class SelfTuning(Structure):
             if m.far[i] > LOST_SAMPLES:  # far off for long
                 m.far[i] = 0.0
                 put(m, i, mean)
+
+    cdef void look(self, double y, double h, const double* u) noexcept nogil:
+        """Predict the members over h, and by what the sample is off."""
+        cdef Members* m = self.members
+        cdef Shared* shared = &m.shared
+        cdef Work* w = &m.work
+        cdef Sample* sample = &w.sample
+        cdef double mean[MOST_STATES]
+        cdef double speed
+        cdef bint same = fabs(h - shared.flow_period) <= EXACT * shared.flow_period
+        cdef int i
+        sample.h = h
+        sample.kept = exp(-h / self.forgetting if self.forgetting > 0.0 else -1.0 / MEMORY)
+        self.carry_flow(h, u, same)
+        speed = (self.prediction.z[0] - self.level[0].z_hat) / h
+        shared.of_stamps = shared.jitter * speed * speed
+        fill_noise(m)
+        self.follow_period(h, same)
+        if self.memory.beyond > 0.0 or shared.recent > 0.0 or sample.quanta > 0.0:
+            shared.moving = HALF
+        if sample.quanta > 0.0:  # P depends on the samples
+            shared.unsettled = 0.0
+        w.first, w.last = HALF - shared.moving, min(HALF + shared.moving, shared.active)
+        sample.off = y - self.prediction.z[0]
+        # A sample that is not likely changes no member: what it makes of them stands apart.
+        for i in range(self.levels):
+            mean[i] = self.level[i].z_hat
+        predict_states(m, h, mean, self.prediction.z)
+        expect(m, h, y)
+        find_knowing(m, self.memory.beyond > 0.0)
+
+    cdef bint is_stamped_late(
+        self, double y, double h, const double* u, double gate
+    ) noexcept nogil:
+        """
+        Return True if an evenly spaced sample is likely at another time than its stamp says.
+
+        Samples wait for a busy host, which stamps them as it reads them. So the time since the
+        last sample that was used may be the usual one, or as its stamp says if that was as late.
+        """
+        cdef Memory* memory = &self.memory
+        cdef double passed, usual = (memory.beyond + 1.0) * self.members.shared.usual_interval
+        for passed in (usual, h - memory.behind):
+            if passed > 0.0:
+                self.look(y, passed, u)
+                if is_likely(self.members, gate, 0.0):
+                    self.passed, self.late = passed, h - passed
+                    return True
+        self.look(y, h, u)
+        return False
 
     cdef void follow_period(self, double h, bint same) noexcept nogil:
         """Decide which covariances move, and what depends on the period (D 27)."""

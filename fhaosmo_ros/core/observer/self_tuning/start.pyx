@@ -108,7 +108,10 @@ cdef double find_noise(Members* m, double least, double largest) noexcept nogil:
         period += m.first_h[i] / (FIRST_SAMPLES - 1)
         values[0][i - 1] = fabs(m.first_h[i] - m.first_h[i - 1])
     size = median(values[0] + 1, FIRST_SAMPLES - 2) / MEDIAN
+    for i in range(1, FIRST_SAMPLES):
+        values[1][i - 1] = m.first_h[i]
     shared.steady_period = period
+    shared.usual_interval = median(values[1], FIRST_SAMPLES - 1)
     shared.jitter = fmax(size * size / 6.0, (EXACT * period) * (EXACT * period))
     ages[0][0] = ages[1][0] = 0.0
     for i in range(1, FIRST_SAMPLES):
