@@ -331,7 +331,7 @@ class Arm:
                 self._evidence = KEEP * self._evidence + own if touched else own
                 likely = np.exp(self._evidence - np.max(self._evidence))
                 shares = likely / np.sum(likely) + ELSEWHERE
-            self._reach = (shares @ reach.reshape(len(q), -1)).reshape(reach.shape[1:])
+            self._reach = np.asarray(shares @ reach.reshape(len(q), -1)).reshape(len(q), len(q))
         link = self.model.links[int(np.argmax(self._evidence))] if self._contact or touched else ''
         q = q.copy()  # the sample is written anew by the next one
         return ArmEstimate(stamp, q, velocity, torques, covariance, odds, self._contact, link)
