@@ -328,16 +328,18 @@ cdef class SelfTuning(Structure):
         Return True if an evenly spaced sample is likely at another time than its stamp says.
 
         Samples wait for a busy host, which stamps them as it reads them. So the time since the
-        last sample that was used may be the usual one, or as its stamp says if that was as late.
+        last sample that was used may be the usual one; or that of the stamps alone, where this is
+        nearly the usual one: then it is as late as that sample.
         """
         cdef Memory* memory = &self.memory
-        cdef double passed, usual = (memory.beyond + 1.0) * self.members.shared.usual_interval
-        for passed in (usual, h - memory.behind):
-            if passed > 0.0:
-                self.look(y, passed, u)
-                if is_likely(self.members, gate, 0.0):
-                    self.passed, self.late = passed, h - passed
-                    return True
+        cdef double usual = (memory.beyond + 1.0) * self.members.shared.usual_interval
+        cdef double passed = h - memory.behind
+        if not 0.5 * usual < passed < 2.0 * usual:
+            passed = usual
+        self.look(y, passed, u)
+        if is_likely(self.members, gate, 0.0):
+            self.passed, self.late = passed, h - passed
+            return True
         self.look(y, h, u)
         return False
 
