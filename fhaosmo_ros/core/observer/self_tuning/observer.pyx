@@ -328,13 +328,13 @@ cdef class SelfTuning(Structure):
         Return True if an evenly spaced sample is likely at another time than its stamp says.
 
         Samples wait for a busy host, which stamps them as it reads them. So the time since the
-        last sample that was used may be the usual one; or that of the stamps alone, where this is
-        nearly the usual one: then it is as late as that sample.
+        last sample that was used may be the usual one; or, if that sample was late, the one of the
+        stamps alone, where this is nearly the usual one.
         """
         cdef Memory* memory = &self.memory
         cdef double usual = (memory.beyond + 1.0) * self.members.shared.usual_interval
         cdef double passed = h - memory.behind
-        if not 0.5 * usual < passed < 2.0 * usual:
+        if memory.behind == 0.0 or not 0.5 * usual < passed < 2.0 * usual:
             passed = usual
         self.look(y, passed, u)
         if is_likely(self.members, gate, 0.0):
