@@ -198,7 +198,7 @@ def test_samples_that_nearly_coincide_are_no_jump_and_do_no_harm(free, number, a
     (lambda tau, g, load: tau * [1, -1, 1], {}, 'the effort of shoulder has the wrong sign'),
     (lambda tau, g, load: tau - g, {}, 'effort to gravity_compensated'),
     (lambda tau, g, load: tau, {'effort': 'gravity_compensated'}, 'effort to torque'),
-    (lambda tau, g, load: tau, {'gravity': [0.0, 0.0, -9.8]}, 'as if it were [3.9'),
+    (lambda tau, g, load: tau, {'gravity': [0.0, 0.0, -9.8]}, 'as if it were [3.98, 5.0'),
     (lambda tau, g, load: tau + load, {}, 'parameter payload to [1.'),
 ])  # fmt: skip
 def test_a_setting_that_is_wrong_is_said(wrong, options, text):

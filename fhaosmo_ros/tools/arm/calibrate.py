@@ -9,7 +9,7 @@ from typing import Any
 
 from fhaosmo_ros.core.arm.arm import Arm
 from fhaosmo_ros.core.arm.identification import identify, payload_of_motion, unexplained
-from fhaosmo_ros.core.arm.model import ArmModel, Floats
+from fhaosmo_ros.core.arm.model import Floats
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.stop_signals import Stop
 from fhaosmo_ros.tools.arm import recording
@@ -51,7 +51,8 @@ def _calibrate(arguments: argparse.Namespace, stop: Stop) -> None:
     values = recording.arm_parameters(arguments) | {'measurement': 'position'}
     if (arguments.payload or arguments.check) and not values.get('calibration_file'):
         raise ConfigurationError(
-            '--payload, --check: expected -p calibration_file:=FILE of this arm, got none'
+            '--payload, --check: expected -p calibration_file:=FILE of the arm without payload, '
+            'got none'
         )
     with stop.raising(), BagReader(arguments.bag) as reader:
         urdf = recording.description(reader, arguments)
@@ -68,7 +69,8 @@ def _calibrate(arguments: argparse.Namespace, stop: Stop) -> None:
         if arm.parameters['effort'] == 'gravity_compensated':
             torque = effort + np.array([arm.model.terms(row, 0.0 * row).gravity for row in q])
         if arguments.check:
-            left = unexplained(ArmModel(urdf, joints=arm.joints), t, q, torque, arm.calibration)
+            alone = Arm(urdf, values | {'calibration_file': ''}).model  # with gravity and payload
+            left = unexplained(alone, t, q, torque, arm.calibration)
             print(_table(arm.joints, 'URDF', 'calibrated', *left))
             return
         if arguments.payload:
