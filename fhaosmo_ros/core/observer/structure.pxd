@@ -75,7 +75,7 @@ cdef class Structure:
     cdef Row trial_covariance[MOST_LEVELS]
     cdef double innovation[MOST_LEVELS]  # eps_i = m_i - z_hat_i after the latest sample
     cdef double loss, gradient  # L and dL/dgamma
-    cdef double passed, late  # time that a step takes for passed, and how late its stamp is (s)
+    cdef double passed  # the time that a step takes for passed (s)
     cdef public int word  # status word of the latest sample
     cdef bint busy  # a run without the GIL is under way
 

@@ -132,7 +132,7 @@ cdef class Structure:
             elapsed = h + memory.pending
             if elapsed + memory.behind <= 0.0:
                 memory.behind = 0.0
-            self.passed, self.late = elapsed + memory.behind, 0.0
+            self.passed = elapsed + memory.behind
             copy_levels(self.levels, self.level, self.before)
             self.advance(y, self.passed, u)
             for i in range(self.levels):  # a difference of equals is 0, or NaN if not finite
@@ -159,7 +159,8 @@ cdef class Structure:
                 word = REJECTED_SPIKE
             else:
                 word = self.accept(y, self.passed)
-                memory.y, memory.pending, memory.behind = y, 0.0, self.late
+                memory.behind = elapsed + memory.behind - self.passed
+                memory.y, memory.pending = y, 0.0
                 mean = memory.period if memory.period > 0.0 else self.passed
                 memory.period = mean + FOLLOWING * (min(self.passed, 2.0 * mean) - mean)
         if word & (REJECTED_MEASUREMENT | REJECTED_INPUT) and not word & REJECTED_PERIOD:

@@ -119,14 +119,18 @@ cdef double bound_of_noise(Members* m, int colour, int order) noexcept nogil:
     return fmin(m.rough[0][colour][order], m.rough[1][colour][order])
 
 
-cdef bint is_even(Members* m) noexcept nogil:
-    """Return True if y moves as if its samples were evenly spaced, rather than at their stamps."""
-    cdef double even = INFINITY, by_stamps = INFINITY
+cdef double least_rough(Members* m, int clock, int colour) noexcept nogil:
+    """Return the smallest of what differences by a clock say that the variance is at most."""
+    cdef double least = INFINITY
     cdef int p
     for p in range(1, m.n + 2):
-        even = fmin(even, m.rough[0][0][p])
-        by_stamps = fmin(by_stamps, m.rough[1][0][p])
-    return even < by_stamps
+        least = fmin(least, m.rough[clock][colour][p])
+    return least
+
+
+cdef bint is_even(Members* m) noexcept nogil:
+    """Return True if y moves as if its samples were evenly spaced, rather than at their stamps."""
+    return least_rough(m, 0, 0) < least_rough(m, 1, 0)
 
 
 cdef double usual_speed(Members* m) noexcept nogil:
@@ -268,7 +272,7 @@ cdef VECTORISED follow_noise(Members* m) noexcept nogil:
     cdef double by_stamps
     cdef double average = sample.average
     cdef double widest = sample.largest
-    cdef int c, p
+    cdef int c
     cdef Py_ssize_t g, active = m.shared.active
     for g in range(active):
         variance = w.believed[g] * w.noise[g]
@@ -299,10 +303,8 @@ cdef VECTORISED follow_noise(Members* m) noexcept nogil:
         share = m.noise[c] / w.now[c]  # who adds to the noise answers for it
         m.late[c] *= 1.0 + (1.0 - share) * more
         m.noise[c] *= 1.0 + share * more
-        most, by_stamps = bound_of_noise(m, c, 1), m.rough[1][c][1]
-        for p in range(2, m.n + 2):
-            most = fmin(most, bound_of_noise(m, c, p))
-            by_stamps = fmin(by_stamps, m.rough[1][c][p])
+        by_stamps = least_rough(m, 1, c)
+        most = fmin(least_rough(m, 0, c), by_stamps)
         m.late[c] = share_of_stamps(m, m.late[c], by_stamps)
         m.noise[c] = fmax(fmin(m.noise[c], ROUGH * most), sample.floor)
         rest = bound_of_noise(m, c, m.n + 1)

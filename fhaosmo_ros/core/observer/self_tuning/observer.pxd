@@ -26,7 +26,7 @@ cdef class SelfTuning(Structure):
     cdef void begin_afresh(self) noexcept nogil
     # Parts of a step.
     cdef void step_members(self, double y, double h, const double* u) noexcept nogil
-    cdef void look(self, double y, double h, const double* u) noexcept nogil
+    cdef double look(self, double y, double h, const double* u) noexcept nogil
     cdef bint is_stamped_late(
         self, double y, double h, const double* u, double gate
     ) noexcept nogil

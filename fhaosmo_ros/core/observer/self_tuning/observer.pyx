@@ -234,8 +234,7 @@ cdef class SelfTuning(Structure):
         follow_stamps(m, change)
         even, rough = is_even(m), sample.roughness > HUBER * HUBER
         sample.average = fmin(shared.samples, NOISE_SAMPLES)
-        self.look(y, h, u)
-        speed = (self.prediction.z[0] - self.level[0].z_hat) / h
+        speed = self.look(y, h, u)
         late = fabs(speed * change) if memory.beyond == 0.0 and not even else 0.0
         sample.uneven += fmax(shared.jitter, sample.irregular) * speed * speed
         sample.floor = fmax(sample.quanta, EXACT * EXACT * m.rough[0][0][1])
@@ -252,8 +251,6 @@ cdef class SelfTuning(Structure):
             ) / sample.average
         begins = has_jumped(m, memory.beyond)
         expected = w.believed[shared.likeliest] * w.noise[shared.likeliest]
-        for i in range(self.levels):
-            mean[i] = self.level[i].z_hat
         shared.recent = fmax(shared.recent - 1.0, 0.0)
         begins = begins and not likely
         jumped = begins or (shared.recent > 0.0 and not rough)
@@ -291,8 +288,8 @@ cdef class SelfTuning(Structure):
                 m.far[i] = 0.0
                 put(m, i, mean)
 
-    cdef void look(self, double y, double h, const double* u) noexcept nogil:
-        """Predict the members over h, and by what the sample is off."""
+    cdef double look(self, double y, double h, const double* u) noexcept nogil:
+        """Predict the members over h, and by what the sample is off; return the speed of y."""
         cdef Members* m = self.members
         cdef Shared* shared = &m.shared
         cdef Work* w = &m.work
@@ -320,6 +317,7 @@ cdef class SelfTuning(Structure):
         predict_states(m, h, mean, self.prediction.z)
         expect(m, h, y)
         find_knowing(m, self.memory.beyond > 0.0)
+        return speed
 
     cdef bint is_stamped_late(
         self, double y, double h, const double* u, double gate
@@ -338,7 +336,7 @@ cdef class SelfTuning(Structure):
             passed = usual
         self.look(y, passed, u)
         if is_likely(self.members, gate, 0.0):
-            self.passed, self.late = passed, h - passed
+            self.passed = passed
             return True
         self.look(y, h, u)
         return False
