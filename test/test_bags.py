@@ -205,7 +205,8 @@ def write_ticks(path, order, missing):
     ('abc', {(k, 'c') for k in range(TICKS)}),
 ])  # fmt: skip
 def test_ticks_are_whole(order, missing, tmp_path):
-    ticks = read_ticks(write_ticks(tmp_path / 'bag', order, missing), '/e', 'abc')
+    with BagReader(write_ticks(tmp_path / 'bag', order, missing)) as reader:
+        ticks = read_ticks(reader, '/e', 'abc')
     np.testing.assert_array_equal(ticks['a'], ticks['c'])
     np.testing.assert_array_equal(ticks['b'], ticks['c'])
     broken = {k for k, _ in missing}

@@ -8,7 +8,6 @@ from fhaosmo_ros.core.observer.status import Status
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
 from fhaosmo_ros.tools import plot
 from fhaosmo_ros.tools.bags.reader import BagReader
-from fhaosmo_ros.tools.bags.topics import series
 from fhaosmo_ros.tools.plot import read_curves
 from fhaosmo_ros.tools.replay import command as replay
 import numpy as np
@@ -169,8 +168,8 @@ def test_bag_tables_and_figure_have_what_the_node_finds(samples, tmp_path, monke
             found.append([*tuning, estimator.events.active, *estimator.standard_deviation])
     found, events = np.array(found), estimator.events.taken()
     assert [e.begins for e in events[:2]] == [True, False]
-    of_bag = series(bag, '/estimator/tuning')
     with BagReader(bag) as reader:
+        of_bag = reader.samples('/estimator/tuning')
         _, _, message, _ = next(reader.objects(['/estimator/tuning']))
     assert message.layout.dim[0].label.split(',') == TUNING
     np.testing.assert_array_equal(of_bag.values, found[:, :7])

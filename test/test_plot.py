@@ -4,7 +4,7 @@
 import bag_files as files
 from fhaosmo_ros.core import OnlineEstimator
 from fhaosmo_ros.tools import plot
-from fhaosmo_ros.tools.bags.topics import series
+from fhaosmo_ros.tools.bags.reader import BagReader
 from fhaosmo_ros.tools.bags.types import labelled_array
 from fhaosmo_ros.tools.demo import observers, OTHERS, report, START
 from fhaosmo_ros.tools.plot import COLUMNS, envelope, read_curves
@@ -80,7 +80,8 @@ def test_other_observers_go_through_the_same_samples(bag):
     """What changes begins a table."""
     live, *others = observers(bag, {'gains': 'fixed'})
     assert [c.label for c in others] == [*OTHERS]
-    y = series(bag, '/y')
+    with BagReader(bag) as reader:
+        y = reader.samples('/y')
     alone = OnlineEstimator([*OTHERS.values()][1]).run(y.stamps, y.values)
     np.testing.assert_array_equal(others[1].estimate[:, 0], alone.unknown_input[KNOWN])
     text = report([live, *others], [(files.ORIGIN + 3 * 10**9, 'noise')])

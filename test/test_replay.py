@@ -8,7 +8,6 @@ from commands import ROOT
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.parameters.files import dumps
 from fhaosmo_ros.tools.bags.reader import BagReader
-from fhaosmo_ros.tools.bags.topics import series
 from fhaosmo_ros.tools.bags.writer import BagWriter
 from fhaosmo_ros.tools.replay import command as replay
 import numpy as np
@@ -49,7 +48,8 @@ def test_output_is_a_bag_with_the_estimators_topics_or_a_table(bag, tmp_path, mo
         ('state', rows[:, :2]), ('unknown_input', rows[:, 2]), ('gamma', rows[:, 3]),
         ('stamp', STAMPS),
     ):  # fmt: skip
-        found = series(out, f'/estimator/{topic}')
+        with BagReader(out) as reader:
+            found = reader.samples(f'/estimator/{topic}')
         np.testing.assert_array_equal(found.values, expected_values)
         np.testing.assert_array_equal(found.stamps, STAMPS)
     with BagReader(out) as reader:
@@ -62,8 +62,9 @@ def test_output_is_a_bag_with_the_estimators_topics_or_a_table(bag, tmp_path, mo
     # A bag that has estimates gets the replayed ones beside them.
     again = tmp_path / 'again'
     assert run(out, '-o', again) == 0
-    for name in ('/replay/estimator', '/estimator'):
-        assert len(series(again, f'{name}/state').stamps) == len(STAMPS)
+    with BagReader(again) as reader:
+        for name in ('/replay/estimator', '/estimator'):
+            assert len(reader.samples(f'{name}/state').stamps) == len(STAMPS)
 
 
 def test_parameters_of_a_named_node_by_file_and_command_line(bag, tmp_path, capsys):

@@ -14,7 +14,7 @@ from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.files import load
 from fhaosmo_ros.stop_signals import Stop, Stopped
-from fhaosmo_ros.tools.bags.topics import series
+from fhaosmo_ros.tools.bags.reader import BagReader
 from fhaosmo_ros.tools.bags.writer import BagWriter
 from fhaosmo_ros.tools.cli.command import output_at, progress, run_command, shipped
 from fhaosmo_ros.tools.cli.processes import start_node
@@ -178,7 +178,9 @@ def observers(bag: Path, parameters: Mapping[str, Any]) -> list[Curves]:
     live = live.part(known)._replace(label='this estimator, live')
     if parameters.get('gains') == 'self_tuning':
         return [live]
-    y, of_d = series(bag, '/y'), live._replace(names=['d'], truth=live.truth[:, -1:])
+    with BagReader(bag) as reader:
+        y = reader.samples('/y')
+    of_d = live._replace(names=['d'], truth=live.truth[:, -1:])
     rows = np.searchsorted(y.stamps, live.stamps).clip(max=len(y.stamps) - 1)
     runs = {
         name: OnlineEstimator({**parameters, **changes}).run(y.stamps, y.values)

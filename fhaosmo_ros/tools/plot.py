@@ -13,7 +13,7 @@ from fhaosmo_ros.core.parameters.units import derivative_unit, titled
 from fhaosmo_ros.core.simulation.metrics import chatter, rms
 from fhaosmo_ros.stop_signals import Stop
 from fhaosmo_ros.tools.bags.reader import BagReader
-from fhaosmo_ros.tools.bags.topics import read_ticks, recorded_parameters, series
+from fhaosmo_ros.tools.bags.topics import read_ticks, recorded_parameters
 from fhaosmo_ros.tools.cli.command import output_at, run_command
 from fhaosmo_ros.topics import ESTIMATES, EVENT, STANDARD_DEVIATION, TRUTH
 from matplotlib.axes import Axes
@@ -128,12 +128,12 @@ def _curves(reader: BagReader, name: str, plant: str) -> Curves:
         if values['structure'] == 'cascade' and values['gains'] == 'fixed':
             epsilon = values['epsilon']
     optional = [p for p in ('gamma', STANDARD_DEVIATION) if reader.count(f'{name}/{p}')]
-    ticks = read_ticks(path, name, [*optional, *ESTIMATES])
+    ticks = read_ticks(reader, name, [*optional, *ESTIMATES])
     when = ticks['stamp']
     if not len(when):
         raise ConfigurationError(f'bag {path}: expected whole estimates of {name}, got none')
     estimate = np.column_stack([ticks['state'], ticks['unknown_input']])
-    truth = _truth_at(path, plant, when)
+    truth = _truth_at(reader, plant, when)
     return Curves(
         label=f'{path.resolve().name} {name}',
         stamps=when,
@@ -149,7 +149,7 @@ def _curves(reader: BagReader, name: str, plant: str) -> Curves:
     )
 
 
-def _truth_at(path: Path, plant: str, when: NDArray[np.int64]) -> Floats | None:
+def _truth_at(reader: BagReader, plant: str, when: NDArray[np.int64]) -> Floats | None:
     """
     Return z_1 .. z_n and d at stamps of samples; NaN where the bag lacks them, None without any.
 
@@ -158,7 +158,7 @@ def _truth_at(path: Path, plant: str, when: NDArray[np.int64]) -> Floats | None:
     """
     columns = []
     for part in TRUTH:
-        found = series(path, f'{plant}/{part}')
+        found = reader.samples(f'{plant}/{part}')
         if not len(found.stamps):
             return None
         row = np.searchsorted(found.stamps, when)

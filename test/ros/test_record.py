@@ -102,8 +102,9 @@ def test_replay_follows_a_run_that_began_before_the_recording(live, user, launch
     assert result.returncode == 0, result.stderr
     [(same, count)] = re.findall(r'; (\d+) of (\d+) snapshots are the same', result.stdout)
     assert int(same) == int(count) > 3
-    live = read_ticks(tmp_path / 'out', '/estimator', list(ESTIMATES))
-    replayed = read_ticks(tmp_path / 'out', '/replay/estimator', list(ESTIMATES))
+    with BagReader(tmp_path / 'out') as reader:
+        live = read_ticks(reader, '/estimator', list(ESTIMATES))
+        replayed = read_ticks(reader, '/replay/estimator', list(ESTIMATES))
     there = live['stamp'] >= replayed['stamp'][0]
     assert there.sum() > 150
     row = np.searchsorted(replayed['stamp'], live['stamp'][there])

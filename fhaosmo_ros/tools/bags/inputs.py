@@ -9,7 +9,7 @@ from fhaosmo_ros.core.model.triangular import TriangularModel
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.inputs import Input, known_inputs, measured_output, Pairing
 from fhaosmo_ros.messages.fields import Field
-from fhaosmo_ros.tools.bags.reader import BagReader, FieldSamples
+from fhaosmo_ros.tools.bags.reader import BagReader, Samples
 import numpy as np
 from numpy.typing import NDArray
 
@@ -21,21 +21,10 @@ class BagInputs:
     """
     Where a bag has y and the known inputs of an estimator, by its parameters.
 
-    Parameters
-    ----------
-    reader : BagReader
-    values : mapping
-        Parameters of the channel, complete.
-    model : TriangularModel
-        Says which known inputs there are, and which of them it uses; the others are 0.
-    namespace, channel : str
-        Namespace of the node, and name of the channel, '' without named channels.
-
-    Attributes
-    ----------
-    y : Input
-        With the full name of its topic.
-
+    `values` are those of the channel, complete; `model` says which known inputs there are, and
+    which of them it uses (the others are 0); `namespace` is that of the node, and `channel` the
+    name of the channel, '' without named channels. `y` is where y is, with the full name of its
+    topic.
     """
 
     def __init__(
@@ -59,12 +48,8 @@ class BagInputs:
         self._u = {name: full(its) for name, its in known.items()}
         self.y = full(measured_output(values, channel))
 
-    def samples(self) -> tuple[FieldSamples, Field]:
-        """
-        Return the samples of y, and the field that they were in.
-
-        Raises ConfigurationError if the bag lacks the topic or the field, or has no samples.
-        """
+    def samples(self) -> tuple[Samples, Field]:
+        """Return the samples of y, at least one, and the field that they were in."""
         y, stamp, reader = self.y, self.y.stamp, self._reader
         field = reader.field(y.topic, y.field, y.name)
         if stamp == 'auto' and not field.header and self._values['sampling'] == 'clock':
@@ -77,7 +62,7 @@ class BagInputs:
 
     def at(
         self,
-        samples: FieldSamples,
+        samples: Samples,
         held: Sequence[float] | None = None,
         reject: Callable[[int], None] = lambda _: None,
     ) -> NDArray[np.float64]:
@@ -86,11 +71,10 @@ class BagInputs:
 
         Samples and inputs are taken in the order of the bag, as the node takes them in that of
         arrival. `held` are the inputs before the first ones in the bag, else 0; `reject` gets the
-        number of values that were not finite, and were left out. Raises ConfigurationError if the
-        bag has no such topic or field.
+        number of values that were not finite, and were left out.
         """
-        names, count = self._model.inputs, len(self._model.inputs)
-        pairing = Pairing(self._values, names, self._u, list(held or [0.0] * count))
+        names = self._model.inputs
+        pairing = Pairing(self._values, names, self._u, held or [0.0] * len(names))
         arrivals = [_arrivals(samples, SAMPLE)]
         for name, its in self._u.items():
             field = self._reader.field(its.topic, its.field, its.name)
@@ -108,10 +92,10 @@ class BagInputs:
                 yield from (row for _, row in pairing.released())
             yield from (row for _, row in pairing.released(at_once=True))
 
-        return np.fromiter(paired(), np.dtype((np.float64, count)), len(samples.times))
+        return np.fromiter(paired(), np.dtype((np.float64, len(names))), len(samples.times))
 
 
-def _arrivals(samples: FieldSamples, number: int) -> Iterator[tuple[int, int, int, float]]:
+def _arrivals(samples: Samples, number: int) -> Iterator[tuple[int, int, int, float]]:
     """Yield time in the bag, number of the input or `SAMPLE`, stamp, and value."""
     for time, stamp, value in zip(*(column.tolist() for column in samples), strict=True):
         yield time, number, stamp, value

@@ -3,10 +3,10 @@
 
 from bisect import bisect_left
 from collections import Counter
-from collections.abc import Collection, Container, Iterator, Mapping
+from collections.abc import Callable, Collection, Container, Iterator, Mapping
 from contextlib import contextmanager, ExitStack
 from io import BytesIO
-from itertools import pairwise
+from itertools import chain, islice, pairwise
 from math import inf
 from mmap import ACCESS_READ, mmap
 from operator import itemgetter
@@ -42,18 +42,18 @@ Row = tuple[int, int, int, bytes]
 """Log time and publish time (ns), number of the connection, and message in CDR."""
 
 
-class FieldSamples(NamedTuple):
-    """Samples of one field in the order of the bag."""
+class Samples(NamedTuple):
+    """Numbers of a topic's messages, in the order of the bag."""
 
     times: NDArray[np.int64]  # (K,) that the bag keeps with the messages (mcap: log time), in ns
     stamps: NDArray[np.int64]  # (K,) those that were asked for, in ns
-    values: NDArray[np.float64]  # (K,)
+    values: NDArray[Any]  # (K,) of a field or a Float64; (K, n) of lists; (K,) of a Time, in ns
 
-    def part(self, rows: slice | NDArray[np.bool_]) -> 'FieldSamples':
+    def part(self, rows: slice | NDArray[np.bool_]) -> 'Samples':
         """Return some of the samples."""
-        return FieldSamples(*(column[rows] for column in self))
+        return Samples(*(column[rows] for column in self))
 
-    def unwrapped(self, near: float | None = None) -> 'FieldSamples':
+    def unwrapped(self, near: float | None = None) -> 'Samples':
         """Return the samples of an angle with its turns counted; see `Unwrapper`."""
         return self._replace(values=np.array([*map(Unwrapper(near), self.values.tolist())]))
 
@@ -63,8 +63,8 @@ class BagReader:
     An open bag: a folder with metadata.yaml, or one storage file of it.
 
     Where the file has CRCs, what is read agrees with them; and a topic that is read to its end has
-    as many messages as the bag lists. Anything else is an error in one line, and so is a file that
-    was cut, or whose writer was killed.
+    as many messages as the bag lists. Anything else is a ConfigurationError of one line, and so is
+    a path that is no bag, and a file that was cut, or whose writer was killed.
 
     Attributes
     ----------
@@ -76,11 +76,6 @@ class BagReader:
         True if something was read that has no CRC, so that damage may go unnoticed.
     lacking : Counter of str
         Messages that `samples` has left out, by why they lack the field.
-
-    Raises
-    ------
-    ConfigurationError
-        It is not a bag, or it cannot be read.
 
     """
 
@@ -120,15 +115,7 @@ class BagReader:
         return sorted(topic.removesuffix(f'/{part}') for topic in found)
 
     def message_type(self, topic: str) -> str:
-        """
-        Return a topic's message type.
-
-        Raises
-        ------
-        ConfigurationError
-            The topic is absent (lists those present), or has no message.
-
-        """
+        """Return the type of a topic that has messages; raise ConfigurationError for others."""
         types = {c.topic: str(c.msgtype) for c in self.connections}
         if topic not in types:
             raise ConfigurationError(
@@ -240,28 +227,25 @@ class BagReader:
             raise ConfigurationError(f'bag {self.path}: expected a definition of {kind}, got none')
         return find_field(self.types.fielddefs, kind, text, name)
 
-    def samples(self, topic: str, field: Field, stamp: str = 'reception') -> FieldSamples:
+    def samples(self, topic: str, field: Field | None = None, stamp: str = 'reception') -> Samples:
         """
-        Return the samples of a field; a terminal shows how far it is.
+        Return the samples of a field, by default of all numbers; a terminal shows how far it is.
 
         Messages whose lists are too short or lack the name are left out, as by the node.
 
         Parameters
         ----------
         topic : str
-        field : Field
+        field : Field, optional
+            Default: the data of Float64 or Float64MultiArray, or a Time in nanoseconds.
         stamp : {'auto', 'header', 'source', 'reception'}
             'header': of the messages. 'source': the publish time, which only mcap has; `ros2 bag
             record` writes the publisher's source stamp there. 'reception': of the bag (mcap: log
             time). 'auto': the first of these that there is.
 
-        Raises
-        ------
-        ConfigurationError
-            The messages have no header, or the bag no publish times.
-
         """
-        if stamp == 'header' and not field.header:
+        header = field.stamp if field and field.header else None
+        if stamp == 'header' and not header:
             raise ConfigurationError(
                 f'input_stamp header: expected messages with a header on {topic}, '
                 f'got {self.message_type(topic)}'
@@ -270,26 +254,46 @@ class BagReader:
             raise ConfigurationError(
                 f'input_stamp source: expected an mcap bag, got {self.path} without publish times'
             )
-        if stamp == 'auto':
-            stamp = 'header' if field.header else 'source'
+        by_header = header if stamp in ('auto', 'header') else None
+        by_source = stamp in ('auto', 'source')
+        numbers = field.value if field else _all_numbers(topic)
 
-        def rows() -> Iterator[tuple[int, int, float]]:
+        def samples() -> Iterator[tuple[int, int, Any]]:
             for _, time, message, published in self.objects([topic]):
                 try:
-                    value = field.value(message)
+                    value = numbers(message)
                 except MissingElementError as error:
                     self.lacking[str(error)] += 1
                     continue
-                if stamp == 'header':
-                    yield time, field.stamp(message), value
+                if by_header:
+                    yield time, by_header(message), value
                 else:
-                    yield time, (published if stamp == 'source' else 0) or time, value
+                    yield time, (published if by_source else 0) or time, value
 
-        count, kinds = self.count(topic), [('t', np.int64), ('s', np.int64), ('x', np.float64)]
-        bar = tqdm(rows(), topic, count, leave=False, unit='', unit_scale=True, disable=None)
-        with _readable(self.path):  # a damaged count may ask for more memory than there is
-            table = np.fromiter(bar, kinds)
-        return FieldSamples(*(np.ascontiguousarray(table[name]) for name, _ in kinds))
+        count = self.count(topic)
+        bar = tqdm(samples(), topic, count, leave=False, unit='', unit_scale=True, disable=None)
+        with _readable(self.path):  # as of a number that does not fit into 64 bits
+            rows = iter(bar)
+            first = [*islice(rows, 1)]
+            value = np.asarray(first[0][2] if first else 0.0)
+            kinds = [('t', np.int64), ('s', np.int64), ('x', value.dtype, value.shape)]
+            table = np.fromiter(chain(first, rows), kinds)
+        return Samples(*(np.ascontiguousarray(table[name]) for name, *_ in kinds))
+
+
+def _all_numbers(topic: str) -> Callable[[Any], Any]:
+    """Return what takes all numbers of a message, of which each has as many."""
+    sizes = set()
+
+    def numbers(message: Any) -> Any:
+        if hasattr(message, 'nanosec'):
+            return message.sec * 1_000_000_000 + message.nanosec
+        sizes.add(np.size(message.data))
+        if len(sizes) > 1:
+            raise ConfigurationError(f'topic {topic!r}: expected lists of one length, got several')
+        return message.data
+
+    return numbers
 
 
 def _expect_bag(path: Path) -> None:

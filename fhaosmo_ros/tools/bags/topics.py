@@ -7,8 +7,6 @@ at its begin and at its end. What was published together is found by its stamps 
 """
 
 from collections.abc import Sequence
-from itertools import islice
-from pathlib import Path
 from typing import Any, NamedTuple
 
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
@@ -19,67 +17,17 @@ from fhaosmo_ros.topics import PARAMETERS, TEXT
 import numpy as np
 from numpy.typing import NDArray
 
-BLOCK = 16_384
-"""Messages that are made arrays of at a time."""
 
-
-class Series(NamedTuple):
-    """The messages of a topic as arrays."""
-
-    stamps: NDArray[np.int64]  # (K,) in nanoseconds
-    values: NDArray[Any]  # (K,) or (K, n), of Float64, Float64MultiArray, or Time (ns, integers)
-
-
-def series(path: Path, topic: str) -> Series:
-    """
-    Read a topic of numbers; empty arrays if it has no message.
-
-    Raises
-    ------
-    ConfigurationError
-        Its messages have lists of different lengths.
-
-    """
-    stamps, values = [np.zeros(0, np.int64)], []
-    with BagReader(path) as reader:
-        rows = reader.objects([topic])
-        while block := list(islice(rows, BLOCK)):  # arrays take less memory than messages
-            stamps.append(np.array([stamp for _, stamp, _, _ in block]))
-            try:
-                values.append(np.array([_numbers(message) for _, _, message, _ in block]))
-            except ValueError:
-                raise ConfigurationError(
-                    f'topic {topic!r}: expected lists of one length, got several'
-                ) from None
-    return Series(np.concatenate(stamps), np.concatenate(values or [np.zeros(0)]))
-
-
-def _numbers(message: Any) -> Any:
-    """Return the data of a message, or a Time in nanoseconds."""
-    if hasattr(message, 'nanosec'):
-        return message.sec * 1_000_000_000 + message.nanosec
-    return message.data
-
-
-def read_ticks(path: Path, name: str, parts: Sequence[str]) -> dict[str, NDArray[Any]]:
+def read_ticks(reader: BagReader, name: str, parts: Sequence[str]) -> dict[str, NDArray[Any]]:
     """
     Return the values of an estimator's topics, a row for each tick that all of them have.
 
-    A tick is what the estimator publishes for one sample: a message on each topic.
-
-    Parameters
-    ----------
-    path : path
-        A bag.
-    name : str
-        Name of the estimator.
-    parts : sequence of str
-        Topics below it; the last one is published last.
-
+    A tick is what the estimator publishes for one sample: a message on each of the topics `parts`
+    below its name, of which the last one is published last.
     """
-    found = {part: series(path, f'{name}/{part}') for part in parts}
-    ticks = found[parts[-1]].stamps
-    rows = {part: _rows_of_ticks(topic.stamps, ticks) for part, topic in found.items()}
+    found = {part: reader.samples(f'{name}/{part}') for part in parts}
+    ticks = found[parts[-1]].times
+    rows = {part: _rows_of_ticks(topic.times, ticks) for part, topic in found.items()}
     whole = np.all([row >= 0 for row in rows.values()], axis=0)
     return {part: topic.values[rows[part][whole]] for part, topic in found.items()}
 
@@ -118,29 +66,15 @@ def recorded_parameters(reader: BagReader, name: str | None = None) -> Recorded 
     """
     Return an estimator's parameters at the begin of the bag, or None if the bag lacks them.
 
-    Later live changes are not among them.
-
-    Parameters
-    ----------
-    reader : BagReader
-    name : str, optional
-        Name of the estimator: its node's, followed by the channel's if it has channels. Default:
-        the only node in the bag that has published its parameters, if it has no channels.
-
-    Raises
-    ------
-    ConfigurationError
-        They are not parameters of this version.
-
+    `name` is that of its node, followed by the channel's if it has channels; by default that of
+    the only node in the bag that has published its parameters, if it has no channels. Later live
+    changes are not among them. ConfigurationError if they are not parameters of this version.
     """
     nodes = [
         node for node in reader.names_above(PARAMETERS)
         if reader.message_type(f'{node}/{PARAMETERS}') == TEXT
     ]  # fmt: skip
-    if name is None:
-        if len(nodes) != 1:
-            return None
-        name = nodes[0]
+    name = name or (nodes[0] if len(nodes) == 1 else '')
     for node in (name, name.rpartition('/')[0]):
         topic = f'{node}/{PARAMETERS}'
         if node in nodes:

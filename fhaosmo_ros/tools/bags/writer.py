@@ -14,7 +14,7 @@ from pathlib import Path
 from struct import Struct
 from typing import Any, NamedTuple
 
-from fhaosmo_ros.tools.bags.reader import BagReader, MESSAGE
+from fhaosmo_ros.tools.bags.reader import BagReader, RECORD
 from fhaosmo_ros.tools.bags.types import learn, OFFERED_QOS, TYPES
 from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
@@ -27,8 +27,12 @@ import yaml
 
 CHUNK_SIZE = 1 << 20
 """Bytes of messages after which a chunk of mcap is closed."""
-HEAD = Struct('<BQHIQQ')
-"""In front of a message in CDR: that of a record, and that of `MESSAGE`."""
+HEAD = (
+    ('opcode', 'u1'), ('length', '<u8'), ('channel', '<u2'), ('sequence', '<u4'),
+    ('stamp', '<u8'), ('published', '<u8'),
+)  # fmt: skip
+"""What stands in front of a message in CDR: the head of a record, and that of a message."""
+PACKED_HEAD = Struct('<BQHIQQ')
 
 
 class _Index(NamedTuple):
@@ -47,16 +51,10 @@ class _Index(NamedTuple):
 
 class BagWriter:
     """
-    Writes serialised messages to a bag in the format of Jazzy's rosbag2.
+    Writes serialised messages to a new folder in the format of Jazzy's rosbag2.
 
     The mcap package's `add_message` takes 4 microseconds, and a replay writes five messages for
     each sample. So the messages of a chunk are joined here, and then given to it all at once.
-
-    Parameters
-    ----------
-    path : path
-        Folder to make; it must not exist.
-
     """
 
     def __init__(self, path: Path) -> None:
@@ -111,23 +109,11 @@ class BagWriter:
         return known
 
     def write(self, topic: str, stamp: int, data: bytes, published: int | None = None) -> None:
-        """
-        Append one message in CDR.
-
-        Parameters
-        ----------
-        topic : str
-        stamp : int
-            In nanoseconds.
-        data : bytes
-        published : int, optional
-            Publish time, which mcap keeps beside the stamp; default: the stamp.
-
-        """
+        """Append a message in CDR, with stamp and publish time (by default the stamp) in ns."""
         channel, sent = self._channels[topic], stamp if published is None else published
+        size = PACKED_HEAD.size - RECORD.size + len(data)
         self._rows.append((channel, stamp, len(self._data)))
-        self._data += HEAD.pack(Opcode.MESSAGE, MESSAGE.size + len(data), channel, 0, stamp, sent)
-        self._data += data
+        self._data += PACKED_HEAD.pack(Opcode.MESSAGE, size, channel, 0, stamp, sent) + data
         if len(self._data) > CHUNK_SIZE:
             self.flush()
 
@@ -135,33 +121,36 @@ class BagWriter:
         self, times: NDArray[np.int64], columns: Mapping[str, tuple[bytes, NDArray[Any]]]
     ) -> None:
         """
-        Append a message of each topic at each time, all at once.
+        Append a message of each topic at each of K times (ns), all at once.
 
-        Parameters
-        ----------
-        times : (K,) array of int
-            In nanoseconds.
-        columns : mapping of str to (bytes, (K,) or (K, m) array)
-            Of each topic a message in CDR that ends with numbers, and the numbers, of the same
-            type, that stand there at each time.
-
+        `columns` has for each topic a message in CDR that ends with numbers, and the numbers, of
+        the same type, that stand there at each time: an array of (K,) or (K, m).
         """
         self.flush()
+        records = {
+            topic: [
+                *HEAD,
+                ('begin', f'V{len(message) - numbers[:1].nbytes}'),
+                ('numbers', numbers.dtype, numbers.shape[1:]),
+            ]
+            for topic, (message, numbers) in columns.items()
+        }
+        lines = np.zeros(len(times), [*records.items()])
+        places = [lines.dtype.fields[topic][1] for topic in columns]
+        for topic, (message, numbers) in columns.items():
+            record = lines[topic]
+            record['opcode'], record['channel'] = Opcode.MESSAGE, self._channels[topic]
+            record['length'] = record.itemsize - RECORD.size
+            record['stamp'] = record['published'] = times
+            record['begin'] = np.void(message[: record['begin'].itemsize])
+            record['numbers'] = numbers
         channels = [self._channels[topic] for topic in columns]
-        line, ends = b'', []  # what is written at a time, and where its messages end
-        for channel, (message, _) in zip(channels, columns.values(), strict=True):
-            size = MESSAGE.size + len(message)
-            line += HEAD.pack(Opcode.MESSAGE, size, channel, 0, 0, 0) + message
-            ends.append(len(line))
-        lines = np.tile(np.frombuffer(line, np.uint8), (len(times), 1))
-        stamps = _in_bytes(np.column_stack([times, times]))
-        for end, (message, numbers) in zip(ends, columns.values(), strict=True):
-            begin, last = end - len(message), _in_bytes(numbers)
-            lines[:, begin - stamps.shape[1] : begin] = stamps
-            lines[:, end - last.shape[1] : end] = last
-        places = len(line) * np.arange(len(times))[:, np.newaxis] + [0, *ends[:-1]]
-        rows = [np.tile(channels, len(times)), np.repeat(times, len(channels)), places.ravel()]
-        self._write_chunk(lines.data, np.column_stack(rows))
+        rows = [
+            np.tile(channels, len(times)),
+            np.repeat(times, len(channels)),
+            (lines.itemsize * np.arange(len(times))[:, np.newaxis] + places).ravel(),
+        ]
+        self._write_chunk(lines.tobytes(), np.column_stack(rows))
 
     def _write_chunk(self, data: bytes | memoryview, rows: NDArray[np.int64]) -> None:
         """Write message records as a chunk: what `Writer.add_message` does for each of them."""
@@ -228,8 +217,3 @@ class BagWriter:
             'files': [{'path': name, **deepcopy(span)}], 'custom_data': None,
             'ros_distro': os.environ.get('ROS_DISTRO') or 'jazzy',
         }  # fmt: skip
-
-
-def _in_bytes(rows: NDArray[Any]) -> NDArray[np.uint8]:
-    """Return the bytes of each row of numbers."""
-    return np.ascontiguousarray(rows).view(np.uint8).reshape(len(rows), -1)

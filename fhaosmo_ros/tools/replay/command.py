@@ -19,7 +19,7 @@ from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.tables import INPUT
 from fhaosmo_ros.stop_signals import Stop
 from fhaosmo_ros.tools.bags.inputs import BagInputs
-from fhaosmo_ros.tools.bags.reader import BagReader, FieldSamples
+from fhaosmo_ros.tools.bags.reader import BagReader, Samples
 from fhaosmo_ros.tools.bags.table import bag_of_table
 from fhaosmo_ros.tools.bags.topics import recorded_parameters
 from fhaosmo_ros.tools.cli.command import output_at, run_command
@@ -166,7 +166,7 @@ def _replay(arguments: argparse.Namespace, stop: Stop) -> None:
 def _estimates(
     estimator: OnlineEstimator,
     live: LiveRun | None,
-    samples: FieldSamples,
+    samples: Samples,
     u: NDArray[np.float64] | None,
     whole: bool,
 ) -> Iterator[Rows]:

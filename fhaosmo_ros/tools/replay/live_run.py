@@ -9,7 +9,7 @@ from fhaosmo_ros.core.online.snapshots import Flag, Snapshot, unpack
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.per_channel import split
 from fhaosmo_ros.core.parameters.tables import ONLINE_PARAMETERS
-from fhaosmo_ros.tools.bags.reader import BagReader, FieldSamples
+from fhaosmo_ros.tools.bags.reader import BagReader, Samples
 from fhaosmo_ros.topics import SNAPSHOT
 import numpy as np
 from numpy.typing import NDArray
@@ -87,7 +87,7 @@ class LiveRun:
         self._begin = ''  # how and where it began
         self._same: list[bool] = []  # whether snapshots are
 
-    def begin(self, samples: FieldSamples) -> FieldSamples:
+    def begin(self, samples: Samples) -> Samples:
         """Return the samples from the first one at which a snapshot tells the live state."""
         estimator, changes = self._estimator, dict[str, Any]()
         while self._events:
