@@ -26,7 +26,7 @@ WRONG = {
     'replay bag --columns t,y': ['--columns: expected a .csv file, got'],
     # Tables.
     f'{TABLE} text.csv': ['text.csv: expected lines of numbers: could not convert str'],
-    f'{TABLE} none.csv': ['none.csv: expected lines of numbers, got an empty file'],
+    f'{TABLE} none.csv': ['none.csv: expected lines of numbers, got none'],
     f'{TABLE} late.csv --columns t,u': ['t, angle, u: of the time, y, torque, got t, u'],
     f'{TABLE} late.csv --columns t,anlge,u': ['t, angle, u: of', 'got t, anlge, u'],
     f'{TABLE} late.csv': ['late.csv: expected times of 0 to 9.2e+09 s, got nan in sample 0'],

@@ -35,24 +35,19 @@ def bag_of_table(path: Path, wanted: str, used: Sequence[str], bag: Path) -> Non
     bag : path
         Folder to make.
 
-    Raises
-    ------
-    ConfigurationError
-        A file that can't be read, a title that it lacks, a wrong number of them, a cell that is
-        no number, or times that are not finite or below 0.
-
     """
     names = ['the time', 'y', *used]
     with path.open(encoding='utf-8-sig', errors='replace') as file:
-        lines = file.readlines()
-    if not any(map(str.strip, lines)):
-        raise ConfigurationError(f'{path}: expected lines of numbers, got an empty file')
-    delimiter = next((mark for mark in DELIMITERS if mark in lines[0]), None)
-    titles = [cell.strip('# "\n') for cell in lines[0].split(delimiter)]
+        lines = [line for line in file if line.strip()]
+    first = lines[0] if lines else ''
+    delimiter = next((mark for mark in DELIMITERS if mark in first), None)
+    titles = [cell.strip(' "\n') for cell in first.lstrip('# ').split(delimiter)]
     try:  # a line of numbers has no titles
         titles = [str(k + 1) for k, _ in enumerate(map(_number, titles))]
     except ValueError:
         del lines[0]
+    if not lines:
+        raise ConfigurationError(f'{path}: expected lines of numbers, got none')
     columns = [title.strip() for title in wanted.split(',') if title.strip()]
     columns = columns or titles[: len(names)]
     if len(columns) != len(names) or not set(columns) <= set(titles):
@@ -60,8 +55,6 @@ def bag_of_table(path: Path, wanted: str, used: Sequence[str], bag: Path) -> Non
             f'--columns: expected {len(names)} titles of {path}, which are {", ".join(titles)}: '
             f'of {", ".join(names)}, got {", ".join(columns)}'
         )
-    if not lines:
-        raise ConfigurationError(f'{path}: expected lines of numbers, got none')
     places = [titles.index(title) for title in columns]
     try:
         t, *numbers = np.loadtxt(
