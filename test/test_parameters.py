@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Declared parameters, those of many channels, parameter files, and YAML from anybody."""
 
-import argparse
 from array import array
 import time
 import warnings
@@ -16,7 +15,8 @@ from fhaosmo_ros.core.parameters.tables import (
     NODE_TABLES,
 )
 from fhaosmo_ros.core.parameters.yaml_text import MAX_DEPTH, MAX_LENGTH, parse
-from fhaosmo_ros.tools.cli.options import add_parameter_options, assigned, channel_parameters
+from fhaosmo_ros.tools.cli.command import values_of
+from fhaosmo_ros.tools.replay.command import channel_parameters, options
 from hypothesis import given, HealthCheck, settings
 from hypothesis import strategies as st
 import numpy as np
@@ -138,9 +138,7 @@ def test_bad_names_and_values_are_refused(values, reason):
 
 
 def replayed(*words):
-    parser = argparse.ArgumentParser()
-    add_parameter_options(parser)
-    return channel_parameters(parser.parse_args(words))
+    return channel_parameters(options().parse_args(['bag', *words]))
 
 
 def test_one_file_serves_channels_and_plant_and_a_replay_takes_one_channel(tmp_path):
@@ -268,7 +266,7 @@ def test_hostile_text_is_content_or_one_line(name):
         assert reason.startswith('expected YAML, got: ')
         assert REASONS[name] in reason
     assert refusal_of(ESTIMATOR_PARAMETERS['lambda'].coerce, text)
-    refusal_of(assigned, [f'lambda:={text}'], ESTIMATOR_PARAMETERS)
+    refusal_of(ESTIMATOR_PARAMETERS.coerce, values_of([f'lambda:={text}']))
     for whole in (text, setting(f'lambda: {text}')):
         assert refusal_of(loads, whole, 'estimator', ESTIMATOR_PARAMETERS)
 

@@ -12,8 +12,7 @@ from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.files import load
 from fhaosmo_ros.messages.joints import joint_sample
 from fhaosmo_ros.tools.bags.reader import BagReader
-from fhaosmo_ros.tools.cli.command import progress
-from fhaosmo_ros.tools.cli.options import add_value_options, assigned
+from fhaosmo_ros.tools.cli.command import add_value_options, progress, values_of
 import numpy as np
 from numpy.typing import NDArray
 
@@ -37,7 +36,7 @@ def arm_parameters(arguments: argparse.Namespace) -> dict[str, Any]:
     values: dict[str, Any] = {}
     for path in arguments.params_file:
         values |= load(path, 'arm', ARM_PARAMETERS)
-    return values | assigned(arguments.param, ARM_PARAMETERS)
+    return values | ARM_PARAMETERS.coerce(values_of(arguments.param))
 
 
 def description(reader: BagReader, arguments: argparse.Namespace) -> str:

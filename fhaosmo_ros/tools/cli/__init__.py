@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What commands share: how they run, their options, child processes."""
+"""What commands share: how they run, child processes."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What all commands share: arguments, signals, one-line errors, exit codes, output, progress."""
+"""What all commands share: options, signals, one-line errors, exit codes, output, progress."""
 
 import argparse
 from collections.abc import Callable, Iterator, Sequence
@@ -11,9 +11,11 @@ import re
 import shlex
 import shutil
 import sys
+from typing import Any
 
 from fhaosmo_ros import __version__
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
+from fhaosmo_ros.core.parameters.yaml_text import parse
 from fhaosmo_ros.stop_signals import Stop, stop_on_signals, Stopped
 from tqdm import tqdm
 
@@ -24,7 +26,10 @@ progress = partial(tqdm, disable=None)
 
 def run_command(parser: argparse.ArgumentParser, argv: Sequence[str] | None, body: Body) -> int:
     """
-    Run a command.
+    Run a command with what follows its name (by default ``sys.argv[1:]``); return its exit code.
+
+    That is what the body returns, 0 for None; 2 for wrong input, or an output that cannot be
+    written; 130 if it was interrupted. Each but the first is said in one line.
 
     SIGINT, SIGTERM and SIGHUP do the same: they set the event `stop` that the body gets, also in a
     process that was started with SIGINT ignored, as a shell without job control starts its
@@ -32,24 +37,9 @@ def run_command(parser: argparse.ArgumentParser, argv: Sequence[str] | None, bod
     ``with stop.raising():``, which raises it. Either way its context managers end: no child
     process and no half of an output stays behind.
 
-    Parameters
-    ----------
-    parser : ArgumentParser
-        Its ``prog`` is the command's name.
-    argv : sequence of str or None
-        What follows the command's name; ``sys.argv[1:]`` by default.
-    body : callable
-        Gets the parsed arguments and the event. ``arguments.command_line`` is what was typed,
-        without the passwords in URLs, as outputs keep it; ``arguments.ros_arguments`` is the
-        part of it between ``--ros-args`` and ``--`` or the end, which a launch file adds to every
-        program.
-
-    Returns
-    -------
-    int
-        What the body returns, 0 for None; 2 for wrong input, or an output that cannot be written;
-        130 if it was interrupted. Each but the first is said in one line.
-
+    The body also gets the arguments. ``arguments.command_line`` is what was typed, without the
+    passwords in URLs, as outputs keep it; ``arguments.ros_arguments`` is the part of it between
+    ``--ros-args`` and ``--`` or the end, which a launch file adds to every program.
     """
     given = list(sys.argv[1:] if argv is None else argv)
     if '--version' in given:
@@ -81,6 +71,31 @@ def without_password(text: str) -> str:
     return re.sub(r'(://[^:/@\s]*:)\S*@', r'\1***@', text)
 
 
+def add_value_options(parser: argparse.ArgumentParser, which: str) -> None:
+    """Add --params-file, whose help says `which` parameters, and -p."""
+    parser.add_argument(
+        '--params-file', type=Path, action='append', default=[], metavar='FILE', help=which
+    )
+    parser.add_argument(
+        '-p', '--param', action='append', default=[], metavar='NAME:=VALUE',
+        help='set one parameter; wins over files, and over a bag',
+    )  # fmt: skip
+
+
+def values_of(rules: Sequence[str]) -> dict[str, Any]:
+    """Return the values that rules NAME:=VALUE set."""
+    values = {}
+    for rule in rules:
+        name, separator, text = rule.partition(':=')
+        if not separator:
+            raise ConfigurationError(f'-p: expected NAME:=VALUE, got {rule!r}')
+        try:
+            values[name] = parse(text)
+        except ConfigurationError:
+            values[name] = text
+    return values
+
+
 @contextmanager
 def output_at(final: Path, force: bool = False) -> Iterator[Path]:
     """
@@ -88,20 +103,8 @@ def output_at(final: Path, force: bool = False) -> Iterator[Path]:
 
     It is complete when the block ends without an error; else nothing stays, and what was there
     before does. The path that is yielded has the final name, in a hidden folder beside its place,
-    and does not exist yet.
-
-    Parameters
-    ----------
-    final : path
-        Must be absent or an empty folder, unless `force`.
-    force : bool
-        Replace what is there.
-
-    Raises
-    ------
-    ConfigurationError
-        The path is in use.
-
+    and does not exist yet. ConfigurationError if the place is in use, unless `force`: by a file,
+    or a folder that is not empty.
     """
     if final.name in ('', '..'):  # nothing could be renamed to it
         raise ConfigurationError(f'output {final}: expected a name, got a folder that is in use')
@@ -133,12 +136,6 @@ def shipped(relative: str) -> Path:
 
     It looks beside the sources (a checkout, colcon build --symlink-install), then in the
     prefixes of a sourced workspace, then in the Python environment (pip install).
-
-    Raises
-    ------
-    ConfigurationError
-        The file is in none of these places.
-
     """
     prefixes = filter(None, os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep))
     places = [Path(__file__).resolve().parents[3]]

@@ -8,22 +8,30 @@ from pathlib import Path
 import sys
 from tempfile import TemporaryDirectory
 from time import perf_counter
+from typing import Any
 
 from fhaosmo_ros.core.model.triangular import TriangularModel
 from fhaosmo_ros.core.observer.estimates import Trajectory
 from fhaosmo_ros.core.observer.status import UNUSED
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.online.events import Event
-from fhaosmo_ros.core.parameters.declaration import ParameterTable
+from fhaosmo_ros.core.parameters.declaration import Parameters, ParameterTable
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
-from fhaosmo_ros.core.parameters.tables import INPUT
+from fhaosmo_ros.core.parameters.files import read, select, with_origin
+from fhaosmo_ros.core.parameters.per_channel import of_named_channel
+from fhaosmo_ros.core.parameters.tables import (
+    CHANNEL_PARAMETERS,
+    ESTIMATOR_PARAMETERS,
+    INPUT,
+    ONLINE_PARAMETERS,
+)
+from fhaosmo_ros.inputs import with_joints
 from fhaosmo_ros.stop_signals import Stop
 from fhaosmo_ros.tools.bags.inputs import BagInputs
 from fhaosmo_ros.tools.bags.reader import BagReader, Samples
 from fhaosmo_ros.tools.bags.table import bag_of_table
-from fhaosmo_ros.tools.bags.topics import recorded_parameters
-from fhaosmo_ros.tools.cli.command import output_at, run_command
-from fhaosmo_ros.tools.cli.options import add_parameter_options, channel_parameters, named
+from fhaosmo_ros.tools.bags.topics import Recorded, recorded_parameters
+from fhaosmo_ros.tools.cli.command import add_value_options, output_at, run_command, values_of
 from fhaosmo_ros.tools.replay.live_run import find_estimator, LiveRun
 from fhaosmo_ros.tools.replay.sinks import Rows, sink, TABLES
 from fhaosmo_ros.topics import ESTIMATES, TOPIC_NAME
@@ -36,6 +44,11 @@ BLOCK = 16_384
 
 def main(argv: list[str] | None = None) -> int:
     """Run the command; return 0 if the output is complete, else there is none."""
+    return run_command(options(), argv, _replay)
+
+
+def options() -> argparse.ArgumentParser:
+    """Return the parser of the command's arguments."""
     parser = argparse.ArgumentParser(
         prog='replay',
         description='Estimate offline from a recorded bag, with the result of the live node.',
@@ -72,8 +85,44 @@ def main(argv: list[str] | None = None) -> int:
         help='put before the topics of the estimates (default: /estimator, or /replay/estimator '
         'where the bag already holds estimates)',
     )  # fmt: skip
-    add_parameter_options(parser)
-    return run_command(parser, argv, _replay)
+    add_value_options(
+        parser, "parameters of the estimator node, as in 'ros2 run' (default: those in the bag)"
+    )
+    add(
+        '--node', default='estimator', metavar='NAME',
+        help='whose sections of the files to take, such as /rig/estimator (default: %(default)s)',
+    )  # fmt: skip
+    add(
+        '--channel', default='', metavar='NAME',
+        help="take the parameters of this one of the node's channels",
+    )  # fmt: skip
+    return parser
+
+
+def channel_parameters(
+    arguments: argparse.Namespace, recorded: Recorded | None = None
+) -> Parameters:
+    """Return the parameters of a channel: those `recorded`, changed by files, and these by -p."""
+    given: list[tuple[Any, dict[str, Any]]] = []
+    if recorded:
+        given.append((f'topic {recorded.topic!r}', recorded.values))
+    given += [(path, read(path, arguments.node, strict=True)) for path in arguments.params_file]
+    values: dict[str, Any] = {}
+    origins: dict[str, Any] = {}
+    for origin, found in [*given, (None, values_of(arguments.param))]:
+        values |= found
+        origins |= dict.fromkeys(found, origin)
+    try:
+        values = select(values, ESTIMATOR_PARAMETERS)
+    except ConfigurationError as error:
+        raise with_origin(error, origins) from None
+    own = of_named_channel(with_joints(values), arguments.channel, '--channel')
+    parameters = CHANNEL_PARAMETERS.complete(Parameters(ESTIMATOR_PARAMETERS, own))
+    try:
+        OnlineEstimator(parameters)
+    except ConfigurationError as error:
+        raise with_origin(error, origins, arguments.channel) from None
+    return parameters
 
 
 def _replay(arguments: argparse.Namespace, stop: Stop) -> None:
@@ -96,6 +145,8 @@ def _replay(arguments: argparse.Namespace, stop: Stop) -> None:
         if recorded:
             arguments.channel = arguments.channel or recorded.channel
         values = channel_parameters(arguments, recorded)
+        named = [name.removeprefix(f'{arguments.channel}.') for name in values_of(arguments.param)]
+        named = [name for name in named if name in ONLINE_PARAMETERS]
         if is_table:
             # The file says where y and u are, not the topics of a node.
             values = values.changed(ParameterTable(INPUT).defaults())
@@ -105,7 +156,7 @@ def _replay(arguments: argparse.Namespace, stop: Stop) -> None:
         if arguments.smooth:
             estimator.smooth()
         if followed is not None:
-            live = LiveRun(reader, followed, estimator, named(arguments))
+            live = LiveRun(reader, followed, estimator, named)
         namespace = recorded.namespace if recorded else arguments.node.rpartition('/')[0]
         model = estimator.observer.model
         inputs = BagInputs(reader, values, model, namespace, arguments.channel)
@@ -151,8 +202,7 @@ def _replay(arguments: argparse.Namespace, stop: Stop) -> None:
             'replay: warning: the bag has no ~/parameters to take, so the defaults are used; '
             "--params-file gives the node's own", file=sys.stderr,
         )  # fmt: skip
-    changed = named(arguments)
-    changes = f', with {", ".join(changed)} of the command line' if changed else ''
+    changes = f', with {", ".join(named)} of the command line' if named else ''
     print(f'parameters: {origin}{changes}')
     if live:
         print(live.report())

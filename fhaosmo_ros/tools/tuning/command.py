@@ -15,8 +15,7 @@ from fhaosmo_ros.core.simulation.recordings import SENSOR
 from fhaosmo_ros.stop_signals import Stop
 from fhaosmo_ros.tools.bags.inputs import BagInputs
 from fhaosmo_ros.tools.bags.reader import BagReader
-from fhaosmo_ros.tools.cli.command import output_at, run_command
-from fhaosmo_ros.tools.cli.options import add_value_options, assigned
+from fhaosmo_ros.tools.cli.command import add_value_options, output_at, run_command, values_of
 from fhaosmo_ros.tools.tuning import report
 from fhaosmo_ros.tools.tuning.identify import Identification
 from fhaosmo_ros.tools.tuning.linear_gains import chosen_otherwise
@@ -126,6 +125,6 @@ def read_parameters(files: list[Path], rules: list[str]) -> tuple[dict[str, Any]
         # Where only the estimator has a model, the plant has the same one; and so the sensor.
         tuning |= ParameterTable(MODEL, SENSOR).part_of(found)
         tuning |= load(path, 'plant', TUNE_PARAMETERS) | load(path, 'tune', TUNE_PARAMETERS)
-    given = assigned(rules, BOTH)
+    given = BOTH.coerce(values_of(rules))
     estimator |= ESTIMATOR_PARAMETERS.part_of(given)
     return estimator, tuning | TUNE_PARAMETERS.part_of(given)
