@@ -33,7 +33,7 @@ from fhaosmo_ros.tools.bags.table import bag_of_table
 from fhaosmo_ros.tools.bags.topics import Recorded, recorded_parameters
 from fhaosmo_ros.tools.cli.command import add_value_options, output_at, run_command, values_of
 from fhaosmo_ros.tools.replay.live_run import find_estimator, LiveRun
-from fhaosmo_ros.tools.replay.sinks import Rows, sink, TABLES
+from fhaosmo_ros.tools.replay.sinks import bag_sink, Rows, TABLES
 from fhaosmo_ros.topics import ESTIMATES, TOPIC_NAME
 import numpy as np
 from numpy.typing import NDArray
@@ -179,8 +179,9 @@ def _replay(arguments: argparse.Namespace, stop: Stop) -> None:
             u = None
             if estimator.observer.used_inputs:
                 u = inputs.at(samples, estimator.inputs, estimator.reject_inputs)
+            of_bag = reader, name, estimator.observer, values
             sinks = [
-                files.enter_context(sink(path, reader, name, estimator.observer, values))
+                files.enter_context(TABLES.get(path.suffix, bag_sink)(path, *of_bag))
                 for path in outputs
             ]
             for rows in _estimates(estimator, live, samples, u, arguments.smooth):

@@ -32,15 +32,9 @@ class Event(NamedTuple):
 
 def find_estimator(reader: BagReader, name: str | None, channel: str = '') -> str | None:
     """
-    Return the name of the estimator to follow: the one given, or the only one in the bag.
+    Return the name of the estimator to follow: the one given, or the only one with snapshots.
 
     Where several channels have snapshots, `channel` chooses.
-
-    Raises
-    ------
-    ConfigurationError
-        The one given has no snapshots in the bag, or none is given and there are several.
-
     """
     found = reader.names_above(SNAPSHOT)
     if name is not None and name not in found:
@@ -62,21 +56,8 @@ class LiveRun:
     """
     Repeats at an estimator what was done to a live one, at the same samples.
 
-    Parameters
-    ----------
-    reader : BagReader
-    name : str
-        Of the live one: the node's full name, followed by the channel's if it has channels.
-    estimator : OnlineEstimator
-        The one that follows the live one.
-    fixed : collection of str
-        Parameters whose live changes are not repeated.
-
-    Raises
-    ------
-    ConfigurationError
-        A snapshot is of another version, or damaged.
-
+    `name` is the full name of the live one's node, followed by the channel's if it has channels.
+    Live changes of the parameters `fixed` are not repeated.
     """
 
     def __init__(

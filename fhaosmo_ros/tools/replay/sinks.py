@@ -2,7 +2,7 @@
 """Where replayed estimates go: a bag, a CSV or an NPZ file, block by block."""
 
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 import csv
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -34,29 +34,24 @@ Sink = Callable[[Rows], None]
 """Takes estimates block by block."""
 
 
-def sink(path: Path, *of_bag: Any) -> AbstractContextManager[Sink]:
-    """Open a file or a bag by its suffix; `of_bag` is what follows the path in `bag_sink`."""
-    return TABLES[path.suffix](path) if path.suffix in TABLES else bag_sink(path, *of_bag)
-
-
 def columns(rows: Rows) -> dict[str, NDArray]:
     """Return one array for each column of a table of estimates."""
     e = rows.estimates
-    result = {'stamp_ns': e.t, 'bag_time_ns': rows.times, 'y': rows.y}
-    result |= {f'z{i + 1}': e.z[:, i] for i in range(e.z.shape[1])}
+    states = {f'z{i + 1}': column for i, column in enumerate(e.z.T)}
+    result = {'stamp_ns': e.t, 'bag_time_ns': rows.times, 'y': rows.y, **states}
     result |= {'unknown_input': e.unknown_input, 'gamma': e.gamma}
-    result |= {f'eps{i + 1}': e.innovation[:, i] for i in range(e.innovation.shape[1])}
-    if e.standard_deviation.shape[1]:
-        names = [*(f'z{i + 1}' for i in range(e.z.shape[1])), 'unknown_input']
-        result |= {f'std_{name}': e.standard_deviation[:, i] for i, name in enumerate(names)}
-        result |= {f'tuning_{name}': e.tuning[:, i] for i, name in enumerate(TUNING)}
+    result |= {f'eps{i + 1}': column for i, column in enumerate(e.innovation.T)}
+    # With fixed gains these two have no columns.
+    names = [f'std_{name}' for name in (*states, 'unknown_input')]
+    result |= zip(names, e.standard_deviation.T, strict=False)
+    result |= zip([f'tuning_{name}' for name in TUNING], e.tuning.T, strict=False)
     if len(rows.active):
         result['event'] = rows.active.astype(np.int64)
     return result | {'status': e.status, 'open_levels': e.open_levels}
 
 
 @contextmanager
-def csv_sink(path: Path) -> Iterator[Sink]:
+def csv_sink(path: Path, *_: object) -> Iterator[Sink]:
     """Write a table with a header line; its numbers read back as the same doubles."""
     with path.open('w', encoding='utf-8', newline='') as file:
         writer = csv.writer(file, lineterminator='\n')
@@ -71,7 +66,7 @@ def csv_sink(path: Path) -> Iterator[Sink]:
 
 
 @contextmanager
-def npz_sink(path: Path) -> Iterator[Sink]:
+def npz_sink(path: Path, *_: object) -> Iterator[Sink]:
     """Write arrays by name."""
     blocks: list[dict[str, NDArray]] = []
     yield lambda rows: blocks.append(columns(rows))
@@ -80,7 +75,7 @@ def npz_sink(path: Path) -> Iterator[Sink]:
 
 
 TABLES = {'.csv': csv_sink, '.npz': npz_sink}
-"""Sinks that open a file, by its suffix."""
+"""Sinks that open a file, by its suffix; they take what follows the path in `bag_sink`, too."""
 
 
 @contextmanager
@@ -90,20 +85,9 @@ def bag_sink(
     """
     Write a bag: a copy of another one, and the estimator's topics with a message for every sample.
 
-    All messages of a topic have the same length. So they are made a block at a time: the bytes of
-    one, and behind them each sample's numbers.
-
-    Parameters
-    ----------
-    path : path
-    reader : BagReader
-        What is copied.
-    name : str
-        Name below which the topics of the estimates go.
-    observer : Observer
-    parameters : mapping
-        Parameters of the estimates; written once, as the node publishes them.
-
+    The topics go below `name`; the parameters are written once, as the node publishes them. All
+    messages of a topic have the same length. So they are made a block at a time: the bytes of one,
+    and behind them each sample's numbers.
     """
     text: bytes | None = types.serialise(topics.TEXT, data=dumps(parameters, name))
     unit = derivative_unit(parameters['measurement_unit'], observer.order)
