@@ -165,12 +165,6 @@ def observers(bag: Path, parameters: Mapping[str, Any]) -> list[Curves]:
 
     An estimate is compared with the truth of the sample behind it (``~/stamp``), not with that of
     the moment at which it was published. There are no others if gains tune themselves.
-
-    Raises
-    ------
-    ConfigurationError
-        The bag holds no estimate with its truth.
-
     """
     (live,) = read_curves(bag, ['/estimator'], '/plant')
     if live.truth is None or not (known := np.isfinite(live.truth).all(axis=1)).any():

@@ -98,15 +98,7 @@ class Curves(NamedTuple):
 
 
 def read_curves(path: Path, names: list[str] | None, plant: str) -> list[Curves]:
-    """
-    Read the estimates of some estimators, or of all that a bag holds.
-
-    Raises
-    ------
-    ConfigurationError
-        It is not a bag, or it holds no estimates.
-
-    """
+    """Read the estimates of some estimators, or of all that a bag holds, at least one."""
     with BagReader(path) as reader:
         first, *others = map(reader.names_above, ESTIMATES)
         found = [name for name in first if all(name in other for other in others)]
@@ -120,7 +112,7 @@ def read_curves(path: Path, names: list[str] | None, plant: str) -> list[Curves]
 
 
 def _curves(reader: BagReader, name: str, plant: str) -> Curves:
-    path, epsilon, unit = reader.path, None, ''
+    epsilon, unit = None, ''
     if recorded := recorded_parameters(reader, name):
         own = of_channel(recorded.values, recorded.channel)
         values = ESTIMATOR_PARAMETERS.defaults() | own
@@ -131,11 +123,13 @@ def _curves(reader: BagReader, name: str, plant: str) -> Curves:
     ticks = read_ticks(reader, name, [*optional, *ESTIMATES])
     when = ticks['stamp']
     if not len(when):
-        raise ConfigurationError(f'bag {path}: expected whole estimates of {name}, got none')
+        raise ConfigurationError(
+            f'bag {reader.path}: expected whole estimates of {name}, got none'
+        )
     estimate = np.column_stack([ticks['state'], ticks['unknown_input']])
     truth = _truth_at(reader, plant, when)
     return Curves(
-        label=f'{path.resolve().name} {name}',
+        label=f'{reader.path.resolve().name} {name}',
         stamps=when,
         names=[*(f'z{i + 1}' for i in range(estimate.shape[1] - 1)), 'd'],
         estimate=estimate,
@@ -231,25 +225,15 @@ def save_curves(
     """
     Write a figure of several estimates laid one over another.
 
-    From top to bottom: a row for each state, for d, for errors of d if others are compared, for
-    gamma if an estimate has it, and for the innovations of the first estimate.
-
-    Parameters
-    ----------
-    curves : list of Curves
-    path : path
-        Its suffix names the format.
-    compared : sequence of Curves
-        Others, whose errors of d are drawn beside that of the first one.
-    marks : sequence of (int, str)
-        Times in nanoseconds at which something changed, and what.
-
+    From top to bottom: a row for each state, for d, for errors of d of the first estimate and
+    those it is `compared` with, for gamma if an estimate has it, and for the innovations of the
+    first estimate. `marks` are times (ns) at which something changed, and what.
     """
     first, names = curves[0], max((c.names for c in curves), key=len)
     gamma = ['gamma'] if any(c.gamma is not None for c in curves) else []
     rows = [*names, *(['error of d'] if compared else []), *gamma, 'innovation']
     figure = Figure(figsize=(8.5, 1.45 * len(rows) + 0.9), layout='constrained')
-    axes = dict(zip(rows, figure.subplots(len(rows), 1, sharex=True), strict=True))
+    axes = figure.subplot_mosaic([[row] for row in rows], sharex=True)
     origin = min(c.stamps[0] for c in curves)
     for number, c in enumerate(curves):
         colour, dashes = COLOURS[number % len(COLOURS)], DASHES[number % len(DASHES)]
@@ -272,8 +256,7 @@ def save_curves(
         axes[name].set_ylabel(those[0].title(name))
         # What comes after the first tenth fills the picture.
         late = [c.estimate[len(c.stamps) // 10 :, c.names.index(name)] for c in those]
-        known = np.concatenate(late)
-        known = known[np.isfinite(known)]
+        known = np.ma.masked_invalid(np.concatenate(late)).compressed()
         if len(known):
             margin = 0.1 * float(np.ptp(known)) or 0.1 * abs(float(known[0])) or 1.0
             axes[name].set_ylim(known.min() - margin, known.max() + margin)
@@ -302,11 +285,7 @@ def save_curves(
 
 
 def draw_band(
-    axes: Axes,
-    t: NDArray[np.float64],
-    estimate: NDArray[np.float64],
-    deviation: NDArray[np.float64],
-    colour: str = COLOURS[0],
+    axes: Axes, t: Floats, estimate: Floats, deviation: Floats, colour: str = COLOURS[0]
 ) -> None:
     """Draw the band of two standard deviations, in which the truth is for 95 % of the time."""
     known = np.where(np.isfinite(deviation), deviation, np.nan)
@@ -319,9 +298,7 @@ def draw_band(
     )  # fmt: skip
 
 
-def _draw_innovations(
-    axes: Axes, t: NDArray[np.float64], eps: NDArray[np.float64], epsilon: float | None
-) -> None:
+def _draw_innovations(axes: Axes, t: Floats, eps: Floats, epsilon: float | None) -> None:
     """Draw |eps_1| .. |eps_N| on a logarithmic scale, and the band within which gates open."""
     size = np.abs(eps)
     for k in range(eps.shape[1]):

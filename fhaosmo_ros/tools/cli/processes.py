@@ -15,18 +15,10 @@ GRACE = 5.0
 
 class Child(subprocess.Popen[bytes]):
     """
-    A Python process whose output goes to a file; it ends with its `with` block.
+    A Python process whose output goes to the file `log`; it ends with its `with` block.
 
-    Parameters
-    ----------
-    log : path
-        Its output.
-    arguments : str
-        What follows ``python``.
-    options
-        For `subprocess.Popen`: ``start_new_session=True`` lets Ctrl-C in a terminal reach only
-        the parent.
-
+    `arguments` are what follows ``python``. The option ``start_new_session=True`` lets Ctrl-C in
+    a terminal reach only the parent.
     """
 
     def __init__(self, log: Path, *arguments: str, **options: Any) -> None:
