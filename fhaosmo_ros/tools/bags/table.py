@@ -68,13 +68,11 @@ def bag_of_table(path: Path, wanted: str, used: Sequence[str], bag: Path) -> Non
             f'{path}: expected times of 0 to {LATEST:g} s, got {t[bad[0]]} in sample {bad[0]}, '
             'counted from 0'
         )
-    empty = serialise(FLOAT, data=0.0)
-    messages = {f'/{n}': (empty, x) for n, x in zip(names[1:], numbers, strict=True)}
+    stamps = np.round(t * 1e9).astype(np.int64).clip(1)  # 0 is a stamp that nobody filled
     with BagWriter(bag) as writer:
-        for topic in messages:
-            writer.add(topic, FLOAT)
-        stamps = np.round(t * 1e9).astype(np.int64)
-        writer.write_columns(np.maximum(stamps, 1), messages)  # 0 is a stamp that nobody filled
+        for name, values in zip(names[1:], numbers, strict=True):
+            writer.add(f'/{name}', FLOAT)
+            writer.write_column(f'/{name}', stamps, serialise(FLOAT, data=0.0), values)
 
 
 def _number(text: str) -> float:

@@ -7,7 +7,7 @@ in time order with no message indexes'), as it closes chunks that hold no messag
 rosbag2 names a storage file, so that `ros2 bag reindex` finds it.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from copy import deepcopy
 import os
 from pathlib import Path
@@ -79,7 +79,6 @@ class BagWriter:
         message_type: str,
         qos: Sequence[dict[str, Any]] = (OFFERED_QOS,),
         types: Any = TYPES,
-        digest: str = '',
     ) -> bool:
         """Add a topic if the bag lacks it; return False if its type has no definition here."""
         known = message_type in types.fielddefs or (types is TYPES and learn(message_type))
@@ -88,9 +87,9 @@ class BagWriter:
         if not known:
             # A type that is not installed, or an old bag without definitions. Readers compare
             # the hash with the definition, so both are those of a message without fields.
-            types, digest = get_typestore(Stores.EMPTY), ''
+            types = get_typestore(Stores.EMPTY)
             types.register(get_types_from_msg('', message_type))
-        digest = digest or types.hash_rihs01(message_type)
+        digest = types.hash_rihs01(message_type)
         if message_type not in self._schemas:
             text, _ = types.generate_msgdef(message_type, ros_version=2)
             self._schemas[message_type] = self._writer.register_schema(
@@ -117,42 +116,28 @@ class BagWriter:
         if len(self._data) > CHUNK_SIZE:
             self.flush()
 
-    def write_columns(
-        self, times: NDArray[np.int64], columns: Mapping[str, tuple[bytes, NDArray[Any]]]
+    def write_column(
+        self, topic: str, times: NDArray[np.int64], message: bytes, numbers: NDArray[Any]
     ) -> None:
         """
-        Append a message of each topic at each of K times (ns), all at once.
+        Append a message at each of K times (ns), all at once.
 
-        `columns` has for each topic a message in CDR that ends with numbers, and the numbers, of
-        the same type, that stand there at each time: an array of (K,) or (K, m).
+        `message`, in CDR, ends with numbers; `numbers`, of the same type, are what stands there at
+        each time: an array of (K,) or (K, m).
         """
         self.flush()
-        records = {
-            topic: [
-                *HEAD,
-                ('begin', f'V{len(message) - numbers[:1].nbytes}'),
-                ('numbers', numbers.dtype, numbers.shape[1:]),
-            ]
-            for topic, (message, numbers) in columns.items()
-        }
-        lines = np.zeros(len(times), [*records.items()])
-        places = [lines.dtype.fields[topic][1] for topic in columns]
-        for topic, (message, numbers) in columns.items():
-            record = lines[topic]
-            record['opcode'], record['channel'] = Opcode.MESSAGE, self._channels[topic]
-            record['length'] = record.itemsize - RECORD.size
-            record['stamp'] = record['published'] = times
-            record['begin'] = np.void(message[: record['begin'].itemsize])
-            record['numbers'] = numbers
-        channels = [self._channels[topic] for topic in columns]
-        rows = [
-            np.tile(channels, len(times)),
-            np.repeat(times, len(channels)),
-            (lines.itemsize * np.arange(len(times))[:, np.newaxis] + places).ravel(),
-        ]
-        self._write_chunk(lines.tobytes(), np.column_stack(rows))
+        begin = message[: len(message) - numbers[:1].nbytes]
+        of_numbers = 'numbers', numbers.dtype, numbers.shape[1:]
+        records = np.zeros(len(times), [*HEAD, ('begin', f'V{len(begin)}'), of_numbers])
+        records['opcode'], records['channel'] = Opcode.MESSAGE, self._channels[topic]
+        records['length'] = records.itemsize - RECORD.size
+        records['stamp'] = records['published'] = times
+        records['begin'] = np.void(begin)
+        records['numbers'] = numbers
+        places = records.itemsize * np.arange(len(times))
+        self._write_chunk(records.tobytes(), np.column_stack([records['channel'], times, places]))
 
-    def _write_chunk(self, data: bytes | memoryview, rows: NDArray[np.int64]) -> None:
+    def _write_chunk(self, data: bytes, rows: NDArray[np.int64]) -> None:
         """Write message records as a chunk: what `Writer.add_message` does for each of them."""
         chunk, statistics = self._writer._Writer__chunk_builder, self._statistics
         first, last = int(rows[:, 1].min()), int(rows[:, 1].max())
@@ -174,7 +159,7 @@ class BagWriter:
         """Copy every topic as it is."""
         for c in reader.connections:
             qos = dump_qos_v9(c.ext.offered_qos_profiles)
-            self.add(c.topic, c.msgtype, qos, reader.types, c.digest)
+            self.add(c.topic, c.msgtype, qos, reader.types)
         for topic, stamp, data, published in reader.messages():
             self.write(topic, stamp, data, published)
 

@@ -116,10 +116,8 @@ def bag_sink(
             e = rows.estimates
             stamps = np.column_stack(np.divmod(e.t, 1_000_000_000)).astype('<i4')
             found = {**e._asdict(), 'state': e.z, 'stamp': stamps}  # others have their own names
-            bag.write_columns(rows.times, {
-                f'{name}/{topic}': (message, found[topic])
-                for topic, message in empty.items()
-            })  # fmt: skip
+            for topic, message in empty.items():
+                bag.write_column(f'{name}/{topic}', rows.times, message, found[topic])
             for time, event in rows.events:
                 bag.add(f'{name}/{topics.EVENT}', topics.DIAGNOSTICS, qos=[types.LATCHED_QOS])
                 status = f'{name.lstrip("/")}: event'
