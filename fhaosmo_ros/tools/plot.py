@@ -86,11 +86,6 @@ class Curves(NamedTuple):
     unit: str = ''  # of y, '' if the bag does not say it
     events: Sequence[tuple[int, int]] = ()  # begin and end of each, in nanoseconds
 
-    def title(self, name: str) -> str:
-        """Return one of `names` with its unit, which follows from that of y."""
-        unit = derivative_unit(self.unit, self.names.index(name))
-        return titled('unknown\ninput d' if name == 'd' else name, unit)
-
     def part(self, rows: slice | NDArray[np.bool_]) -> 'Curves':
         """Return some of the rows."""
         arrays = {k: x for k, x in self._asdict().items() if isinstance(x, np.ndarray)}
@@ -253,7 +248,8 @@ def save_curves(
             axes['gamma'].set_ylabel('power γ')
     for name in names:
         those = [c for c in curves if name in c.names]
-        axes[name].set_ylabel(those[0].title(name))
+        unit = derivative_unit(those[0].unit, names.index(name))
+        axes[name].set_ylabel(titled('unknown\ninput d' if name == 'd' else name, unit))
         # What comes after the first tenth fills the picture.
         late = [c.estimate[len(c.stamps) // 10 :, c.names.index(name)] for c in those]
         known = np.ma.masked_invalid(np.concatenate(late)).compressed()

@@ -65,29 +65,18 @@ class BagReader:
     Where the file has CRCs, what is read agrees with them; and a topic that is read to its end has
     as many messages as the bag lists. Anything else is a ConfigurationError of one line, and so is
     a path that is no bag, and a file that was cut, or whose writer was killed.
-
-    Attributes
-    ----------
-    connections : list of Connection
-        Of rosbags: topics with their types and message counts; a topic may appear twice.
-    types : Typestore
-        Of rosbags, with the bag's own definitions of types.
-    unchecked : bool
-        True if something was read that has no CRC, so that damage may go unnoticed.
-    lacking : Counter of str
-        Messages that `samples` has left out, by why they lack the field.
-
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.unchecked = False
-        self.lacking: Counter[str] = Counter()
+        self.unchecked = False  # True if data without a CRC was read: its damage goes unnoticed
+        self.lacking: Counter[str] = Counter()  # messages that `samples` left out, by the reason
         with _readable(path), ExitStack() as stack:
             _expect_bag(path)
             reader = stack.enter_context(AnyReader([path], default_typestore=TYPES))
+            # Topics, their types and message counts; a topic may appear twice.
             self.connections: list[Connection] = list(reader.connections)
-            self.types = reader.typestore
+            self.types = reader.typestore  # with the bag's own definitions
             storage: Any = reader.readers[0].storage
             self._storages = storage.storages if path.is_dir() else [storage]
             for storage in self._storages:
@@ -229,20 +218,14 @@ class BagReader:
 
     def samples(self, topic: str, field: Field | None = None, stamp: str = 'reception') -> Samples:
         """
-        Return the samples of a field, by default of all numbers; a terminal shows how far it is.
+        Return the samples of a field, or of the data of Float64, Float64MultiArray, Time (in ns).
 
-        Messages whose lists are too short or lack the name are left out, as by the node.
+        Messages whose lists are too short or lack the name are left out, as by the node. A
+        terminal shows how far it is.
 
-        Parameters
-        ----------
-        topic : str
-        field : Field, optional
-            Default: the data of Float64 or Float64MultiArray, or a Time in nanoseconds.
-        stamp : {'auto', 'header', 'source', 'reception'}
-            'header': of the messages. 'source': the publish time, which only mcap has; `ros2 bag
-            record` writes the publisher's source stamp there. 'reception': of the bag (mcap: log
-            time). 'auto': the first of these that there is.
-
+        Stamps are those of the headers ('header'), the publish time ('source'), which only mcap
+        has, and where `ros2 bag record` writes the publisher's source stamp, the time in the bag
+        ('reception'; mcap: log time), or the first of these that there is ('auto').
         """
         header = field.stamp if field and field.header else None
         if stamp == 'header' and not header:

@@ -22,19 +22,10 @@ def bag_of_table(path: Path, wanted: str, used: Sequence[str], bag: Path) -> Non
     They are Float64 on /y, and on topics of the known inputs' names: where an estimator looks for
     them of whose inputs nothing is said.
 
-    Parameters
-    ----------
-    path : path
-        Lines of numbers with commas, semicolons, tabs or spaces between them; an empty cell is a
-        missing sample. Titles may stand in the first line; without them the columns are 1, 2, ...
-    wanted : str
-        Titles of the time in seconds, of y and of the known inputs, separated by commas; empty for
-        the first columns.
-    used : sequence of str
-        Known inputs that the model uses, in the order of their columns.
-    bag : path
-        Folder to make.
-
+    The file has lines of numbers with commas, semicolons, tabs or spaces between them; an empty
+    cell is a missing sample. Titles may stand in the first line; without them the columns are 1,
+    2, ... `wanted` are the titles, separated by commas, of the time in seconds, of y and of the
+    known inputs `used`; empty for the first columns.
     """
     names = ['the time', 'y', *used]
     with path.open(encoding='utf-8-sig', errors='replace') as file:

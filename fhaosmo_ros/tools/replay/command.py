@@ -130,7 +130,7 @@ def _replay(arguments: argparse.Namespace, stop: Stop) -> None:
     if arguments.columns and not is_table:
         raise ConfigurationError(f'--columns: expected a .csv file, got {path}')
     bag_name = path.resolve().name.removesuffix('.csv' if is_table else '.mcap')
-    begin = perf_counter()
+    started = perf_counter()
     with ExitStack() as stack:
         if is_table:
             path = Path(stack.enter_context(TemporaryDirectory()), 'table')
@@ -165,6 +165,7 @@ def _replay(arguments: argparse.Namespace, stop: Stop) -> None:
         name = _name({c.topic for c in reader.connections}, arguments.name)
         with stop.raising(), ExitStack() as files:
             samples, field = inputs.samples()
+            begin = int(samples.times[0])
             span = float(samples.stamps[-1] - samples.stamps[0]) * 1e-9
             stamps = 'source (publish times of the bag)'
             if np.array_equal(samples.stamps, samples.times):
@@ -179,7 +180,7 @@ def _replay(arguments: argparse.Namespace, stop: Stop) -> None:
             u = None
             if estimator.observer.used_inputs:
                 u = inputs.at(samples, estimator.inputs, estimator.reject_inputs)
-            of_bag = reader, name, estimator.observer, values
+            of_bag = reader, name, estimator.observer, values, begin
             sinks = [
                 files.enter_context(TABLES.get(path.suffix, bag_sink)(path, *of_bag))
                 for path in outputs
@@ -190,7 +191,7 @@ def _replay(arguments: argparse.Namespace, stop: Stop) -> None:
     c = estimator.counters
     print(
         f'{c.accepted} samples used, {c.rejected} rejected, {c.restarts} restarts; '
-        f'{span:.1f} s of data in {perf_counter() - begin:.2f} s'
+        f'{span:.1f} s of data in {perf_counter() - started:.2f} s'
     )
     for why, count in reader.lacking.items():
         print(f'{count} messages left out: {why}')

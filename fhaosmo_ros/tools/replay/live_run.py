@@ -43,7 +43,7 @@ def find_estimator(reader: BagReader, name: str | None, channel: str = '') -> st
             f'({", ".join(found) or "none"}), got {name!r}'
         )
     of_channel = [other for other in found if channel and other.endswith(f'/{channel}')]
-    wanted = [name] if name else of_channel if len(of_channel) == 1 else found
+    wanted = [name] if name else of_channel or found
     if len(wanted) > 1:
         raise ConfigurationError(
             f'--follow: expected one of the live estimators in the bag ({", ".join(found)}), '

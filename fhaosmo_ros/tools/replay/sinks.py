@@ -80,16 +80,20 @@ TABLES = {'.csv': csv_sink, '.npz': npz_sink}
 
 @contextmanager
 def bag_sink(
-    path: Path, reader: BagReader, name: str, observer: Observer, parameters: Mapping[str, Any]
+    path: Path,
+    reader: BagReader,
+    name: str,
+    observer: Observer,
+    parameters: Mapping[str, Any],
+    begin: int,
 ) -> Iterator[Sink]:
     """
     Write a bag: a copy of another one, and the estimator's topics with a message for every sample.
 
-    The topics go below `name`; the parameters are written once, as the node publishes them. All
-    messages of a topic have the same length. So they are made a block at a time: the bytes of one,
-    and behind them each sample's numbers.
+    The topics go below `name`; the parameters are written at the time `begin` (ns), as the node
+    publishes them. All messages of a topic have the same length. So they are made a block at a
+    time: the bytes of one, and behind them each sample's numbers.
     """
-    text: bytes | None = types.serialise(topics.TEXT, data=dumps(parameters, name))
     unit = derivative_unit(parameters['measurement_unit'], observer.order)
     state = [f'z{i + 1}' for i in range(observer.order)]
     labels = {
@@ -99,6 +103,8 @@ def bag_sink(
     empty = {}
     with BagWriter(path) as bag:
         bag.add(f'{name}/{topics.PARAMETERS}', topics.TEXT, qos=[types.LATCHED_QOS])
+        text = types.serialise(topics.TEXT, data=dumps(parameters, name))
+        bag.write(f'{name}/{topics.PARAMETERS}', begin, text)
         for topic, kind in topics.estimates_of(parameters).items():
             bag.add(f'{name}/{topic}', kind)
             if kind == topics.ARRAY:
@@ -109,10 +115,6 @@ def bag_sink(
         bag.copy(reader)
 
         def write(rows: Rows) -> None:
-            nonlocal text
-            if text:
-                bag.write(f'{name}/{topics.PARAMETERS}', int(rows.times[0]), text)
-                text = None
             e = rows.estimates
             stamps = np.column_stack(np.divmod(e.t, 1_000_000_000)).astype('<i4')
             found = {**e._asdict(), 'state': e.z, 'stamp': stamps}  # others have their own names
