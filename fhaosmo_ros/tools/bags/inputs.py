@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Recorded samples of y, and the known inputs at them, as the node finds them."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from heapq import merge
 from typing import Any
 
@@ -60,18 +60,13 @@ class BagInputs:
             raise ConfigurationError(f'topic {y.topic!r}: {why}')
         return samples, field
 
-    def at(
-        self,
-        samples: Samples,
-        held: Sequence[float] | None = None,
-        reject: Callable[[int], None] = lambda _: None,
-    ) -> NDArray[np.float64]:
+    def at(self, samples: Samples, held: Sequence[float] = ()) -> NDArray[np.float64]:
         """
         Return the known inputs at samples of y, (K, m).
 
         Samples and inputs are taken in the order of the bag, as the node takes them in that of
-        arrival. `held` are the inputs before the first ones in the bag, else 0; `reject` gets the
-        number of values that were not finite, and were left out.
+        arrival; values that are not finite are left out. `held` are the inputs before the first
+        ones in the bag, else 0.
         """
         names = self._model.inputs
         pairing = Pairing(self._values, names, self._u, held or [0.0] * len(names))
@@ -79,9 +74,8 @@ class BagInputs:
         for name, its in self._u.items():
             field = self._reader.field(its.topic, its.field, its.name)
             found = self._reader.samples(its.topic, field, its.stamp)
-            good = np.isfinite(found.values)
-            reject(int((~good).sum()))
-            arrivals.append(_arrivals(found.part(good), names.index(name)))
+            good = found.part(np.isfinite(found.values))
+            arrivals.append(_arrivals(good, names.index(name)))
 
         def paired() -> Iterator[list[float]]:
             for _, j, stamp, u in merge(*arrivals):

@@ -34,19 +34,17 @@ def read_ticks(reader: BagReader, name: str, parts: Sequence[str]) -> dict[str, 
 
 def _rows_of_ticks(times: NDArray[np.int64], ticks: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return which message of a topic belongs to each tick, -1 where it is missing."""
-    if not len(times) or not len(ticks):
-        return np.full(len(ticks), -1)
+    first, last = np.iinfo(np.int64).min, np.iinfo(np.int64).max
+    around = np.concatenate([[first], times, [last]])
+    before = np.searchsorted(times, ticks, side='right')  # of each tick, in `around`
+    after = before + 1
+    early = around[before] > np.concatenate([[first], ticks[:-1]])
+    late = around[after] < np.concatenate([ticks[1:], [last]])
     # The estimator publishes it before the last topic; but a recorder that stamps messages as
     # they arrive may have taken it after. The topic's own pauses tell which of the two.
-    before = np.searchsorted(times, ticks, side='right') - 1
-    after = before + 1
-    until = np.concatenate([[np.iinfo(np.int64).min], ticks[:-1]])
-    since = np.concatenate([ticks[1:], [np.iinfo(np.int64).max]])
-    early = (before >= 0) & (times[before] > until)
-    late = (after < len(times)) & (times[after.clip(max=len(times) - 1)] < since)
-    lead = np.median((ticks - times[before])[early]) if early.any() else np.inf
-    lag = np.median(times[after[late]] - ticks[late]) if late.any() else np.inf
-    return np.where(early, before, -1) if lead <= lag else np.where(late, after, -1)
+    lead = np.median((ticks - around[before])[early]) if early.any() else np.inf
+    lag = np.median((around[after] - ticks)[late]) if late.any() else np.inf
+    return (np.where(early, before, 0) if lead <= lag else np.where(late, after, 0)) - 1
 
 
 class Recorded(NamedTuple):
@@ -55,11 +53,6 @@ class Recorded(NamedTuple):
     topic: str
     values: dict[str, Any]  # checked, in their own types; those of channels with channels' names
     channel: str  # the one that was asked for, '' if the node has no named channels
-
-    @property
-    def namespace(self) -> str:
-        """Namespace of the node: '/rig' of /rig/estimator/parameters."""
-        return self.topic.rsplit('/', 2)[0]
 
 
 def recorded_parameters(reader: BagReader, name: str | None = None) -> Recorded | None:

@@ -157,8 +157,8 @@ def _replay(arguments: argparse.Namespace, stop: Stop) -> None:
             estimator.smooth()
         if followed is not None:
             live = LiveRun(reader, followed, estimator, named)
-        namespace = recorded.namespace if recorded else arguments.node.rpartition('/')[0]
-        model = estimator.observer.model
+        node = recorded.topic.rpartition('/')[0] if recorded else arguments.node
+        namespace, model = node.rpartition('/')[0], estimator.observer.model
         inputs = BagInputs(reader, values, model, namespace, arguments.channel)
         finals = arguments.output or [Path(f'{bag_name}_replayed')]
         outputs = [stack.enter_context(output_at(path, arguments.force)) for path in finals]
@@ -177,9 +177,7 @@ def _replay(arguments: argparse.Namespace, stop: Stop) -> None:
             if field.wraps:
                 latest = estimator.state_dict()['y'] + estimator.offset
                 samples = samples.unwrapped(None if estimator.latest is None else latest)
-            u = None
-            if estimator.observer.used_inputs:
-                u = inputs.at(samples, estimator.inputs, estimator.reject_inputs)
+            u = inputs.at(samples, estimator.inputs) if model.used_inputs else None
             of_bag = reader, name, estimator.observer, values, begin
             sinks = [
                 files.enter_context(TABLES.get(path.suffix, bag_sink)(path, *of_bag))
