@@ -16,7 +16,7 @@ from fhaosmo_ros.core.parameters.tables import (
 )
 from fhaosmo_ros.core.parameters.yaml_text import MAX_DEPTH, MAX_LENGTH, parse
 from fhaosmo_ros.tools.cli.command import values_of
-from fhaosmo_ros.tools.replay.command import channel_parameters, options
+from fhaosmo_ros.tools.replay.command import make_estimator, options
 from hypothesis import given, HealthCheck, settings
 from hypothesis import strategies as st
 import numpy as np
@@ -138,7 +138,7 @@ def test_bad_names_and_values_are_refused(values, reason):
 
 
 def replayed(*words):
-    return channel_parameters(options().parse_args(['bag', *words]))
+    return make_estimator(options().parse_args(['bag', *words]))[0]
 
 
 def test_one_file_serves_channels_and_plant_and_a_replay_takes_one_channel(tmp_path):

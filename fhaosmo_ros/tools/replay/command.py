@@ -10,7 +10,6 @@ from tempfile import TemporaryDirectory
 from time import perf_counter
 from typing import Any
 
-from fhaosmo_ros.core.model.triangular import TriangularModel
 from fhaosmo_ros.core.observer.estimates import Trajectory
 from fhaosmo_ros.core.observer.status import UNUSED
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
@@ -99,10 +98,14 @@ def options() -> argparse.ArgumentParser:
     return parser
 
 
-def channel_parameters(
+def make_estimator(
     arguments: argparse.Namespace, recorded: Recorded | None = None
-) -> Parameters:
-    """Return the parameters of a channel: those `recorded`, changed by files, and these by -p."""
+) -> tuple[Parameters, OnlineEstimator]:
+    """
+    Return a channel's parameters, and the estimator that has them.
+
+    They are those `recorded`, changed by files, and these by -p.
+    """
     given: list[tuple[Any, dict[str, Any]]] = []
     if recorded:
         given.append((f'topic {recorded.topic!r}', recorded.values))
@@ -118,11 +121,17 @@ def channel_parameters(
         raise with_origin(error, origins) from None
     own = of_named_channel(with_joints(values), arguments.channel, '--channel')
     parameters = CHANNEL_PARAMETERS.complete(Parameters(ESTIMATOR_PARAMETERS, own))
+    if arguments.bag.suffix == '.csv':  # it says where y and u are, not the topics of a node
+        parameters = parameters.changed(ParameterTable(INPUT).defaults())
+    if arguments.smooth:
+        parameters = parameters.changed({'smoothing_lag': 0.0})
     try:
-        OnlineEstimator(parameters)
+        estimator = OnlineEstimator(parameters)
     except ConfigurationError as error:
         raise with_origin(error, origins, arguments.channel) from None
-    return parameters
+    if arguments.smooth:
+        estimator.smooth()
+    return parameters, estimator
 
 
 def _replay(arguments: argparse.Namespace, stop: Stop) -> None:
@@ -134,7 +143,8 @@ def _replay(arguments: argparse.Namespace, stop: Stop) -> None:
     with ExitStack() as stack:
         if is_table:
             path = Path(stack.enter_context(TemporaryDirectory()), 'table')
-            used = TriangularModel.of(channel_parameters(arguments)).used_inputs
+            _, estimator = make_estimator(arguments)
+            used = estimator.observer.used_inputs
             bag_of_table(arguments.bag, arguments.columns, used, path)
         reader = stack.enter_context(BagReader(path))
         followed = recorded = live = None
@@ -144,17 +154,9 @@ def _replay(arguments: argparse.Namespace, stop: Stop) -> None:
             recorded = recorded_parameters(reader, followed)
         if recorded:
             arguments.channel = arguments.channel or recorded.channel
-        values = channel_parameters(arguments, recorded)
+        values, estimator = make_estimator(arguments, recorded)
         named = [name.removeprefix(f'{arguments.channel}.') for name in values_of(arguments.param)]
         named = [name for name in named if name in ONLINE_PARAMETERS]
-        if is_table:
-            # The file says where y and u are, not the topics of a node.
-            values = values.changed(ParameterTable(INPUT).defaults())
-        if arguments.smooth:
-            values = values.changed({'smoothing_lag': 0.0})
-        estimator = OnlineEstimator(values)
-        if arguments.smooth:
-            estimator.smooth()
         if followed is not None:
             live = LiveRun(reader, followed, estimator, named)
         node = recorded.topic.rpartition('/')[0] if recorded else arguments.node
