@@ -11,7 +11,7 @@ import struct
 import bag_files as files
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.tools.bags.reader import BagReader
-from fhaosmo_ros.tools.bags.topics import read_ticks
+from fhaosmo_ros.tools.bags.recorded import read_ticks
 from fhaosmo_ros.tools.bags.types import LATCHED_QOS, OFFERED_QOS
 from fhaosmo_ros.tools.bags.writer import BagWriter
 from fhaosmo_ros.tools.replay import command as replay

@@ -13,7 +13,7 @@ from fhaosmo_ros.core.parameters.units import derivative_unit, titled
 from fhaosmo_ros.core.simulation.metrics import chatter, rms
 from fhaosmo_ros.stop_signals import Stop
 from fhaosmo_ros.tools.bags.reader import BagReader
-from fhaosmo_ros.tools.bags.topics import read_ticks, recorded_parameters
+from fhaosmo_ros.tools.bags.recorded import read_ticks, recorded_parameters
 from fhaosmo_ros.tools.cli.command import output_at, run_command
 from fhaosmo_ros.topics import ESTIMATES, EVENT, STANDARD_DEVIATION, TRUTH
 from matplotlib.axes import Axes

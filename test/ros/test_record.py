@@ -11,7 +11,7 @@ import bag_files as files
 from commands import COMMAND, environment, ROOT, run, start, take_domain, wait_until
 from fhaosmo_ros.nodes.middleware.messages import message_class
 from fhaosmo_ros.tools.bags.reader import BagReader
-from fhaosmo_ros.tools.bags.topics import read_ticks
+from fhaosmo_ros.tools.bags.recorded import read_ticks
 from fhaosmo_ros.tools.demo import observers, OTHERS
 from fhaosmo_ros.topics import ESTIMATES, EVENT, PARAMETERS, SNAPSHOT
 from mcap.reader import NonSeekingReader

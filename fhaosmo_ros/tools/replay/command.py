@@ -26,10 +26,9 @@ from fhaosmo_ros.core.parameters.tables import (
 )
 from fhaosmo_ros.inputs import with_joints
 from fhaosmo_ros.stop_signals import Stop
-from fhaosmo_ros.tools.bags.inputs import BagInputs
 from fhaosmo_ros.tools.bags.reader import BagReader, Samples
+from fhaosmo_ros.tools.bags.recorded import BagInputs, Recorded, recorded_parameters
 from fhaosmo_ros.tools.bags.table import bag_of_table
-from fhaosmo_ros.tools.bags.topics import Recorded, recorded_parameters
 from fhaosmo_ros.tools.cli.command import add_value_options, output_at, run_command, values_of
 from fhaosmo_ros.tools.replay.live_run import find_estimator, LiveRun
 from fhaosmo_ros.tools.replay.sinks import bag_sink, Rows, TABLES

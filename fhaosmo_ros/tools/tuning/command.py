@@ -13,8 +13,8 @@ from fhaosmo_ros.core.parameters.files import load
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS, MODEL
 from fhaosmo_ros.core.simulation.recordings import SENSOR
 from fhaosmo_ros.stop_signals import Stop
-from fhaosmo_ros.tools.bags.inputs import BagInputs
 from fhaosmo_ros.tools.bags.reader import BagReader
+from fhaosmo_ros.tools.bags.recorded import BagInputs
 from fhaosmo_ros.tools.cli.command import add_value_options, output_at, run_command, values_of
 from fhaosmo_ros.tools.tuning import report
 from fhaosmo_ros.tools.tuning.identify import Identification
