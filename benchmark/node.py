@@ -169,7 +169,7 @@ def observe(case: Case, seconds: float) -> Run:
         held = min(len(watch.heard[t]) for t in stamps) >= HELD * asked
         heard = [(at, nanoseconds(m)) for at, m in watch.heard[stamps[0]]]
         source.interrupt()
-        source.end()
+        source.wait(5.0)
         sent, ended = int(source.output().split()[-1]), time_ns()
         wait_until(lambda: watch.number(node, 'received') > ended, 'no report at the end')
     published, measured = np.array(heard).T

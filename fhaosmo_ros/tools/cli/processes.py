@@ -46,18 +46,14 @@ class Child(subprocess.Popen[bytes]):
         """Ask the child to end."""
         self.send_signal(signal.SIGINT)
 
-    def end(self) -> None:
-        """Wait for the child's end, and kill it if it takes more than `GRACE` seconds."""
+    def __exit__(self, *_: object) -> None:
+        # A second Ctrl-C does not cut this short: a command's handlers of signals raise nothing.
+        self.interrupt()
         try:
             self.wait(GRACE)
         except subprocess.TimeoutExpired:
             self.kill()
             self.wait()
-
-    def __exit__(self, *_: object) -> None:
-        # A second Ctrl-C does not cut this short: a command's handlers of signals raise nothing.
-        self.interrupt()
-        self.end()
 
 
 def start_node(folder: Path, name: str, *arguments: str) -> Child:
