@@ -44,15 +44,14 @@ def test_output_is_a_bag_with_the_estimators_topics_or_a_table(bag, tmp_path, mo
     model = ['-p', 'order:=2', '-p', 'phi:=["0","0"]', '-p', 'gains:=fixed']
     assert run(bag, '-o', out, '-o', arrays, *model) == 0
     rows = expected(STAMPS, Y, {'order': 2, 'phi': ['0', '0'], 'gains': 'fixed'})
-    for topic, expected_values in (
-        ('state', rows[:, :2]), ('unknown_input', rows[:, 2]), ('gamma', rows[:, 3]),
-        ('stamp', STAMPS),
-    ):  # fmt: skip
-        with BagReader(out) as reader:
-            found = reader.samples(f'/estimator/{topic}')
-        np.testing.assert_array_equal(found.values, expected_values)
-        np.testing.assert_array_equal(found.stamps, STAMPS)
     with BagReader(out) as reader:
+        for topic, expected_values in (
+            ('state', rows[:, :2]), ('unknown_input', rows[:, 2]), ('gamma', rows[:, 3]),
+            ('stamp', STAMPS),
+        ):  # fmt: skip
+            found = reader.samples(f'/estimator/{topic}')
+            np.testing.assert_array_equal(found.values, expected_values)
+            np.testing.assert_array_equal(found.stamps, STAMPS)
         _, _, innovation, _ = next(reader.objects(['/estimator/innovation']))
         assert innovation.layout.dim[0].label == 'eps1,eps2,eps3'
         counts = {c.topic: c.msgcount for c in reader.connections}
@@ -191,9 +190,9 @@ MODEL = {'order': 2, 'phi': ['0', '-z1 + torque'], 'inputs': ['torque']}
 
 
 @pytest.mark.parametrize(('first', 'delimiter', 'arguments'), [
-    ('t,angle,torque', ',', []),
+    ('t,angle,torque', ',', ['-p', 'input_topic:=/joint_states', '-p', 'input_field:=position']),
     ('torque;x;"angle";t', ';', ['--columns', 't, angle, torque']),
-    ('# t angle torque', ' ', ['-p', 'input_topic:=/joint_states', '-p', 'input_field:=position']),
+    ('# t angle torque', ' ', ['--columns', 't,angle,torque']),
     ('', '\t', ['--columns', '1,2,3']),
 ])  # fmt: skip
 def test_csv_file_is_estimated_as_its_arrays(tmp_path, first, delimiter, arguments):
