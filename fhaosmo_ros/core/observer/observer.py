@@ -14,6 +14,9 @@ from fhaosmo_ros.core.observer.cascade import Cascade
 from fhaosmo_ros.core.observer.configuration import ObserverConfiguration
 from fhaosmo_ros.core.observer.estimates import Estimate, Trajectory, Tuning
 from fhaosmo_ros.core.observer.levant import Levant
+from fhaosmo_ros.core.observer.self_tuning.observer import SelfTuning
+from fhaosmo_ros.core.observer.smoother import Smoother
+from fhaosmo_ros.core.observer.status import REJECTED
 from fhaosmo_ros.core.observer.structure import run
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.files import make_from_file
@@ -27,8 +30,6 @@ OF_PAPER = 'lambda', 'alpha', 'fuzzy_widths'
 def make_structure(configuration: ObserverConfiguration) -> Any:
     """Return the observer that a configuration asks for, before its first sample."""
     if configuration.self_tuning:
-        from fhaosmo_ros.core.observer.self_tuning.observer import SelfTuning
-
         return SelfTuning(configuration)
     return Levant(configuration) if configuration.levant else Cascade(configuration)
 
@@ -307,9 +308,21 @@ class Observer:
             sample.
 
         """
-        from fhaosmo_ros.core.observer.smoother import smooth
-
-        return smooth(Observer(self.configuration.parameters), t, y, u)
+        observer = Observer(self.configuration.parameters)
+        found = observer.run(t, y, u)
+        if not observer.started:
+            return found
+        first = int(np.argmax((found.status & REJECTED) == 0))
+        u = known_inputs(0.0 if u is None else u, self.inputs, len(found.t))
+        for k in np.flatnonzero(~np.isfinite(u).all(axis=1)).tolist():  # the last ones are held
+            u[k] = u[max(k - 1, first)]
+        smoother = Smoother(observer, every=True)
+        due = smoother.take(found.rows(slice(first, None)), found.t[first:], u[first:])
+        for rows in (due, smoother.finish()):
+            first, begin = first + len(rows.t), first
+            for name in ('z', 'unknown_input', 'standard_deviation'):
+                getattr(found, name)[begin:first] = getattr(rows, name)
+        return found
 
     def _no_input(self) -> float:
         """Return what stands for known inputs that were not given, or raise where phi has one."""

@@ -20,6 +20,7 @@ from fhaosmo_ros.core.observer.kalman cimport (
 from fhaosmo_ros.core.observer.self_tuning.members cimport by_binomials, ORDERS
 from fhaosmo_ros.core.observer.self_tuning.weights cimport Model
 from fhaosmo_ros.core.observer.sliding_mode cimport HUBER, spread_after
+from fhaosmo_ros.core.observer.status cimport DIVERGED, JUMPED, RESTARTED, UNUSED
 from fhaosmo_ros.core.observer.structure cimport MOST_INPUTS
 
 from fhaosmo_ros.core.observer.kalman import LinearModel, STATES_DOUBT, Uncertainty
@@ -54,7 +55,7 @@ cdef struct Point:
     int last  # the level that white noise drives; found by going forward
     double u[MOST_INPUTS]  # known inputs since the row before
     Row own[2]  # the observer's estimates; if it tunes itself, their variances
-    Model model  # with fixed gains kappa is 0, as phi has it
+    Model model  # 0 stands for that of the row before, or for the one of fixed gains
     # What going forward finds.
     double spread  # size of the innovations over that expected, at least 1 (D 21)
     double pull  # e / S; this and the next two are 0 without a sample
@@ -68,24 +69,36 @@ cdef Point example
 POINT = np.asarray(<Point[:1]> &example).dtype
 
 
+def kinds_of(const long long[:] status, long long flags):
+    """
+    Return what the rows of samples are, by their status flags, and the flags of later rows.
+
+    A jump of y, and a restart, are those of the next sample that is used; `flags` are those of
+    the samples since the last one that was.
+    """
+    cdef int[::1] kinds = np.full(len(status), UNMEASURED, dtype=np.intc)
+    cdef Py_ssize_t k
+    for k in range(status.shape[0]):
+        flags |= status[k]
+        if not status[k] & UNUSED:
+            kinds[k] = JUMPS if flags & JUMPED else MEASURED
+            if flags & (RESTARTED | DIVERGED):
+                kinds[k] = BEGINS
+            flags = 0
+    return np.asarray(kinds), flags
+
+
 cdef class Passes:
     """
     The ways forward and back through rows, which are arrays of the type `POINT`.
 
-    Parameters
-    ----------
-    configuration : ObserverConfiguration
-
-    Raises
-    ------
-    ConfigurationError
-        The parameters do not say how large noise and d are.
-
+    It is made from an `ObserverConfiguration`, and raises ConfigurationError where the parameters
+    do not say how large noise and d are.
     """
 
     cdef readonly object configuration
-    cdef readonly object model  # of each row, with fixed gains
-    cdef readonly bint tunes  # a self-tuning observer: the model of d is another one in each row
+    cdef bint tunes  # a self-tuning observer: the model of d is another one in each row
+    cdef Model model  # of each row, with fixed gains; kappa is 0, as phi has it
     cdef Prediction prediction
     cdef int n, order  # levels; states of the model
     cdef bint from_measurement  # z_1 begins at the first sample
@@ -96,22 +109,20 @@ cdef class Passes:
 
     def __cinit__(self, configuration):
         p, model = configuration.parameters, configuration.model
+        self.configuration, self.tunes = configuration, configuration.self_tuning
         self.n, self.order = configuration.levels, model.order
-        self.tunes = configuration.self_tuning
         if self.tunes:
             self.fastest = LinearModel(model.slopes_at_rest + np.eye(self.order, k=1), 0.0).fastest
         elif p['noise_size'] > 0.0 and p['unknown_input']:
             its = Uncertainty(model, p, configuration.state_sizes)
             self.fastest, self.fresh = its.linear.fastest, its.fresh
-            its_model = its.variance, its.intensity, 0.0, self.n - 1 - self.order
-            self.model = np.array(its_model, POINT['model'])
+            self.model = Model(its.variance, its.intensity, 0.0, self.n - 1 - self.order)
         else:
             raise ConfigurationError(
                 "smoothing: expected 'noise_size' > 0 (standard deviation of the noise on y; "
                 f"`tune` writes it) and 'unknown_input' = true, got {p['noise_size']:g} and "
                 f'{str(p["unknown_input"]).lower()}'
             )
-        self.configuration = configuration
         self.prediction = Prediction(configuration.expressions, configuration.prediction_step)
         self.from_measurement = self.tunes or p['start_from_measurement']
         self.first, self.state_sizes = configuration.initial_estimate, configuration.state_sizes
@@ -127,6 +138,11 @@ cdef class Passes:
         cdef Py_ssize_t k
         for k in range(rows.shape[0]):
             now = &rows[k]
+            if not self.tunes:
+                now.model = self.model
+            elif now.model.drive == 0.0 and k > 0:
+                now.model = rows[k - 1].model
+                now.model.derivatives = <int>now.model.derivatives & (ORDERS - 1)
             now.last = self.order + (<int>now.model.derivatives & (ORDERS - 1))
             if now.kind == BEGINS:
                 self.begin(now, &self.first[0])
@@ -134,19 +150,9 @@ cdef class Passes:
                 if self.from_measurement:
                     now.x[0] = now.y
             elif k > 0:
-                self.take(&rows[k - 1], now)
-
-    cdef void take(self, const Point* before, Point* now) noexcept nogil:
-        """Go forward to a row from the one before it."""
-        cdef int i
-        now.spread = before.spread
-        self.predict(before, now)
-        if now.kind == JUMPS:  # nothing before it matters to z_1, which is y (D 23)
-            for i in range(self.n):
-                now.f[0][i] = now.p[0][i] = now.p[i][0] = 0.0
-            now.p[0][0], now.x[0] = now.model.noise, now.y
-        elif now.kind == MEASURED:
-            self.measure(now)
+                now.spread = rows[k - 1].spread
+                self.predict(&rows[k - 1], now)
+                self.take(now)
 
     cdef void begin(self, Point* now, const double* x) noexcept nogil:
         """Begin at a row with an estimate: nothing before it matters."""
@@ -244,11 +250,17 @@ cdef class Passes:
             if SURER * now.p[i][i] < now.own[1][i] < INFINITY:
                 now.p[i][i] = now.own[1][i]
 
-    cdef void measure(self, Point* now) noexcept nogil:
+    cdef void take(self, Point* now) noexcept nogil:
         """Weigh the sample of a row (D 24); after a jump of d it says of what size (D 34)."""
         cdef int i, j, d = self.order
         cdef double s = now.p[0][0] + now.model.noise, e = now.y - now.x[0], share
         cdef double factor
+        if now.kind == JUMPS:  # nothing before it matters to z_1, which is y (D 23)
+            for i in range(self.n):
+                now.f[0][i] = now.p[0][i] = now.p[i][0] = 0.0
+            now.p[0][0], now.x[0] = now.model.noise, now.y
+        if now.kind != MEASURED:
+            return
         now.spread = spread_after(now.spread, e, sqrt(s))
         factor = max(fabs(e) / (HUBER * now.spread * sqrt(s)), 1.0)
         if now.model.derivatives < 0.0 and factor > 1.0:
@@ -266,14 +278,14 @@ cdef class Passes:
     # Back
 
     cdef void go_back(
-        self, Point[::1] rows, Py_ssize_t last, Py_ssize_t begin, Py_ssize_t end, double doubt,
-        double[:, :, ::1] out
+        self, const Point[::1] rows, Py_ssize_t last, Py_ssize_t begin, Py_ssize_t end,
+        bint doubted, double[:, :, ::1] out
     ) noexcept nogil:
         """
         Write what rows up to `last` say of those from `begin` to `end` (D 25).
 
-        With a `doubt` write x as it would become if all samples were as predicted, but the
-        estimates behind row `last` were off by so many standard deviations.
+        If `doubted`, write x as it would become if all samples were as predicted, but the
+        estimates behind row `last` were off by a standard deviation.
         """
         cdef double costate[MOST_LEVELS]
         cdef double behind[MOST_LEVELS]
@@ -284,31 +296,27 @@ cdef class Passes:
         cdef Py_ssize_t k
         cdef int i, j, n = self.n
         memset(known, 0, sizeof(known))
-        memset(a, 0, sizeof(a))
         for i in range(n):
-            a[i][i] = 1.0
-            costate[i] = doubt / sqrt(now.p[i][i]) if now.p[i][i] > 0.0 else 0.0
+            costate[i] = 1.0 / sqrt(now.p[i][i]) if doubted and now.p[i][i] > 0.0 else 0.0
         for k in range(last, begin - 1, -1):
             now = &rows[k]
-            total = 0.0 if doubt > 0.0 else now.pull
+            total = 0.0 if doubted else now.pull
             for i in range(n):
                 total += now.certainty * now.p[0][i] * costate[i]
             costate[0] -= total
-            if self.tunes:
+            if self.tunes and k < last:
                 for j in range(n):
                     total = 0.0
                     for i in range(n):
+                        a[i][j] = rows[k + 1].f[j][i]
                         total += now.p[0][i] * a[i][j]
                     a[0][j] -= now.certainty * total
                 carry(n, a, known)
-                known[0][0] += now.certainty
+            known[0][0] += now.certainty
             if k < end:
                 self.write(now, costate, known, &out[k, 0, 0])
             memcpy(behind, costate, n * sizeof(double))
             total = 0.0
-            for i in range(n if self.tunes else 0):
-                for j in range(n):
-                    a[j][i] = now.f[i][j]
             for j in range(n):
                 costate[j] = 0.0
                 for i in range(n):
@@ -319,7 +327,7 @@ cdef class Passes:
                 memset(known, 0, sizeof(known))
 
     cdef void write(
-        self, const Point* now, const double* costate, const Row* known, double* out
+        self, const Point* now, const double* costate, Row* known, double* out
     ) noexcept nogil:
         """Write the estimates of a row, and of a self-tuning observer the variances of errors."""
         cdef Row less[MOST_LEVELS]
@@ -340,36 +348,31 @@ cdef class Passes:
 
         With a lag (ns) these are the ones that are so old, by what was known when they became so
         old; a row that begins makes all before it due, which will not be known better. Where
-        numbers overflow estimates are the observer's.
-
-        Returns
-        -------
-        (K, 1 or 2, N) array
-            With the variances of their errors, for a self-tuning observer.
-
+        numbers overflow estimates are the observer's. They are a (K, 2, N) array, with variances
+        of their errors if the observer tunes itself.
         """
         cdef Point[::1] point = rows
         cdef Py_ssize_t due = 0, done = 0, count = point.shape[0], k
-        cdef bint whole = lag is None
-        cdef long long age = 0 if whole else lag
-        cdef double[:, :, ::1] out = np.empty((end, 1 + self.tunes, self.n))
-        for k in range(count - 1 if whole else 0, count):
+        cdef long long age = 0 if lag is None else lag
+        cdef double[:, :, ::1] out = np.zeros((end, 2, self.n))
+        for k in range(count - 1 if lag is None else 0, count):
             while due < min(end, k + 1) and (
-                whole or point[k].time - point[due].time >= age
+                lag is None or point[k].time - point[due].time >= age
                 or (point[k].kind >= BEGINS and due < k)
             ):
                 due += 1
             if due > done:
-                self.go_back(point, k, done, due, 0.0, out)
+                self.go_back(point, k, done, due, False, out)
                 done = due
-        found, own = np.asarray(out)[:due], rows['own'][:due, :1 + self.tunes, :self.n]
-        return np.where(np.isfinite(found).all(axis=(1, 2), keepdims=True), found, own)
+        found = np.asarray(out)[:due]
+        finite = np.isfinite(found).all(axis=(1, 2), keepdims=True)
+        return np.where(finite, found, rows['own'][:due, :, :self.n])
 
     def settled(self, rows):
         """Return how many of the first rows samples to come change by `TOLERANCE` at most."""
         cdef Py_ssize_t count = len(rows)
-        cdef double[:, :, ::1] out = np.empty((count, 1 + self.tunes, self.n))
-        self.go_back(rows, count - 1, 0, count, 1.0, out)
+        cdef double[:, :, ::1] out = np.empty((count, 2, self.n))
+        self.go_back(rows, count - 1, 0, count, True, out)
         x, p = rows['x'][:, :self.n], rows['p'].diagonal(0, 1, 2)[:, :self.n]
         change, allowed = np.abs(np.asarray(out)[:, 0] - x), TOLERANCE * np.sqrt(np.abs(p))
         is_open = (change > allowed + ROUNDING * np.abs(x)).any(axis=1)
