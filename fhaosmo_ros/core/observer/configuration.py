@@ -5,6 +5,7 @@ from collections.abc import Mapping
 import math
 from typing import Any
 
+from fhaosmo_ros.core.model.phi import Expressions
 from fhaosmo_ros.core.model.triangular import TriangularModel
 from fhaosmo_ros.core.observer.fuzzy import curves, of_level, read_system
 from fhaosmo_ros.core.observer.kalman import LinearModel, Uncertainty
@@ -27,49 +28,37 @@ class ObserverConfiguration:
     """
     A valid set of observer parameters, and what follows from it for each level.
 
-    Parameters
-    ----------
-    parameters : mapping
-        Values by name, checked here unless they are `Parameters`; defaults for the rest.
-
-    Attributes
-    ----------
-    model : TriangularModel
-    expressions : Expressions
-        Phi_1 .. Phi_n, and the model of the unknown input behind them (D 17).
-    levels : int
-        N.
-    self_tuning, levant, adaptive, is_sign : bool
-        Which observer it is: with gains found by itself; of Levant's structure; with adaptive
-        gamma; with sign instead of a fuzzy curve.
-    predicting, implicit, internal : bool
-        It follows the model between samples; a step uses the sample at its end; estimates are the
-        internal states.
-    epsilon, gamma_initial : float
-    state_sizes : (n,) array
-    prediction_step : float
-        Longest Runge-Kutta step between samples (s).
-    initial_estimate, initial_internal : (N,) arrays
-    lambdas, alphas, widths, decays : (N,) arrays
-        Gains, half-widths of psi, and decay of the internal states; with fixed gains only.
-    curves : (N, K) array
-        psi of each level at K points of [0, half-width]; with fixed gains only.
-    schedule : Uncertainty or None
-        What gains that follow the covariance P are computed from (D 20); None where they are
-        always the tuned ones.
-    steady : (N, N) array
-        P of the predictions once it is steady; with levant and a schedule, else (0, 0).
-    tuned_over_kalman : (N,) array
-        The tuned corrections of a small innovation over those of the Kalman filter; likewise.
-    next_sizes : (N,) array
-        Sizes of z_2 .. z_n and d, 0 behind them; likewise.
-
-    Raises
-    ------
-    ConfigurationError
-        An unknown name, a bad value, or values that do not fit together.
-
+    Values by name are checked here unless they are `Parameters`; defaults for the rest. Raises
+    ConfigurationError: an unknown name, a bad value, or values that do not fit together.
     """
+
+    model: TriangularModel
+    expressions: Expressions  # Phi_1 .. Phi_n, and the model of the unknown input behind (D 17)
+    levels: int  # N
+    self_tuning: bool  # it finds its gains by itself
+    levant: bool  # it has Levant's structure
+    adaptive: bool  # gamma adapts
+    is_sign: bool  # psi is sign instead of a fuzzy curve
+    predicting: bool  # it follows the model between samples
+    implicit: bool  # a step uses the sample at its end
+    internal: bool  # estimates are the internal states
+    epsilon: float
+    gamma_initial: float
+    state_sizes: Floats  # (n,)
+    prediction_step: float  # longest Runge-Kutta step between samples (s)
+    initial_estimate: Floats  # (N,), and so is all that has no other shape
+    initial_internal: Floats
+    # With fixed gains only:
+    lambdas: Floats
+    alphas: Floats
+    widths: Floats  # half-widths of psi
+    decays: Floats  # of the internal states
+    curves: Floats  # (N, K): psi of each level at K points of [0, half-width]
+    schedule: Uncertainty | None  # what says P, where gains follow it (D 20)
+    # What only levant with scheduled gains uses:
+    steady: Floats  # (N, N) or (0, 0): P of the predictions once it is steady
+    tuned_over_kalman: Floats  # tuned corrections of a small innovation over the Kalman filter's
+    next_sizes: Floats  # of z_2 .. z_n and d, 0 behind them
 
     def __init__(self, parameters: Mapping[str, Any]) -> None:
         p = self.parameters = OBSERVER_PARAMETERS.complete(parameters)
@@ -79,8 +68,8 @@ class ObserverConfiguration:
                 "parameters 'gamma_min', 'gamma_initial', 'gamma_max': expected each at most the "
                 f'next one, got {p["gamma_min"]}, {p["gamma_initial"]}, {p["gamma_max"]}'
             )
-        self.self_tuning: bool = p['gains'] == 'self_tuning'
-        self.schedule: Uncertainty | None = None
+        self.self_tuning = p['gains'] == 'self_tuning'
+        self.schedule = None
         self.steady, n = np.zeros((0, 0)), self.model.order
         self.state_sizes = per_level(OBSERVER_PARAMETERS['state_sizes'], p['state_sizes'], n)
         self.prediction_step = p['prediction_step'] or usual_step(self.model)
@@ -121,6 +110,7 @@ class ObserverConfiguration:
         self.gamma_initial = p['gamma_initial'] if adaptive else FIXED_GAMMA
         self.epsilon = np.inf if self.levant else p['epsilon']  # one innovation has no gates
         self.levels = levels = n + (1 + p['unknown_input_derivatives']) * p['unknown_input']
+        self.tuned_over_kalman, self.next_sizes = np.ones(levels), np.zeros(levels)
         self.initial_estimate = self._per_level('initial_estimate')
         self.initial_internal = self._per_level('initial_internal')
         if self.levant:
@@ -176,7 +166,6 @@ class ObserverConfiguration:
     def _complete_schedule(self, schedule: Uncertainty) -> None:
         p, n, small = self.parameters, self.levels, self.parameters['noise_size']
         period, shares = p['correction_period'], deadbeat_shares(n)
-        self.next_sizes, self.tuned_over_kalman = np.zeros(n), np.ones(n)
         self.next_sizes[: self.model.order] = [*self.state_sizes[1:], p['unknown_input_size']]
         self.steady = schedule.steady(period)
         level, grid = np.arange(1, n + 1), np.linspace(0.0, 1.0, self.curves.shape[1])
@@ -196,21 +185,10 @@ def deadbeat_shares(count: int) -> Floats:
     """
     Return the weights of a correction that is deadbeat for a chain of integrators (D 18).
 
-    The i-th derivative's backward difference formula is (-ln(1 - B))^i / h^i, B y_k = y_k -
-    y_{k-1}. Cut off after B^j it is exact for polynomials of degree j. Row j of the result says
-    what a chain of j + 1 integrators has to take over of a prediction error of its first state,
-    so that such a polynomial is known exactly after j + 1 samples.
-
-    Parameters
-    ----------
-    count : int
-        Largest number of integrators.
-
-    Returns
-    -------
-    (count, count) array
-        Weight of the error / h^i in the i-th derivative, row j; 0 for i > j.
-
+    Row j says what a chain of j + 1 integrators has to take over of a prediction error of its
+    first state, as error / h^i in the i-th derivative, so that a polynomial of degree j is known
+    exactly after j + 1 samples. The i-th derivative's backward difference formula is
+    (-ln(1 - B))^i / h^i, B y_k = y_k - y_{k-1}, cut off after B^j; `count` rows and columns.
     """
     logarithm = np.zeros(count)  # of the power series -ln(1 - x)
     logarithm[1:] = 1.0 / np.arange(1, count)

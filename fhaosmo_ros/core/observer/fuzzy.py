@@ -24,6 +24,7 @@ SHAPES: dict[str, Callable[[Any], Any]] = {
     'gaussian': lambda off: 0.5 ** np.square(2.0 * off),
 }
 """Membership by the distance from a term's peak, in parts of that to its neighbour's."""
+CLAUSES = 'terms', 'input', 'output', 'rules', 'curve'
 SINGLETON = 'singleton'
 """Terms of the output may also be points."""
 MOST_TERMS = 99
@@ -56,29 +57,10 @@ class FuzzySystem(NamedTuple):
 
 def read_system(text: str) -> FuzzySystem | Curve:
     """
-    Read the text of a system: clauses with ``;`` between them, each a word and its values.
+    Read the text of a system, or the samples of a curve, as docs/mathematics.md explains them.
 
-    ==================== ==========================================================================
-    ``terms [S] P``      membership functions of input and output
-    ``input [S] P``      those of the input alone
-    ``output [S] P``     those of the output alone
-    ``rules k1 k2 ..``   output term of each input term, counted from 1; default: 1 2 3 ..
-    ``curve 0 v1 v2 ..`` instead of all these: evenly spaced samples of psi over [0, 1]
-    ==================== ==========================================================================
-
-    S is a shape, triangle where it is left out. P is the number of terms that divide [-1, 1]
-    evenly, or their peaks. Peaks and rules are their own mirror images: psi is odd.
-
-    Returns
-    -------
-    FuzzySystem, or array
-        Of the samples.
-
-    Raises
-    ------
-    ConfigurationError
-        The text is no system.
-
+    Peaks and rules have to be their own mirror images: psi is odd. Raises ConfigurationError for
+    a text that is no system.
     """
     clauses: dict[str, list[str]] = {}
     for clause in text.split(';'):
@@ -117,9 +99,6 @@ def read_system(text: str) -> FuzzySystem | Curve:
         if np.any(sums != (most + 1 if row is numbers else 0.0)):
             raise _refused(text, f'an odd curve, from {what} that are mirrored', shown(row))
     return FuzzySystem(inputs, outputs, rules)
-
-
-CLAUSES = ('terms', 'input', 'output', 'rules', 'curve')
 
 
 def _refused(text: str, allowed: str, got: str) -> ConfigurationError:
@@ -163,23 +142,10 @@ def _terms(text: str, words: Sequence[str], shapes: Sequence[str]) -> Terms:
 
 def memberships(universe: Curve, terms: Terms) -> Curve:
     """
-    Return the membership functions of terms.
+    Return the membership functions of terms, not singletons, at K points of [-1, 1]: a row a term.
 
     A triangle reaches 0 at its neighbours' peaks; a trapezoid is 1 over half of that; trapezoids
     and bells cross their neighbours at 1/2. The outermost terms are 1 beyond their peaks.
-
-    Parameters
-    ----------
-    universe : (K,) array
-        Where to evaluate them, within [-1, 1].
-    terms : Terms
-        No singletons.
-
-    Returns
-    -------
-    (terms, K) array
-        One row a term.
-
     """
     peaks = np.array(terms.peaks)[:, np.newaxis]
     gaps, off = np.diff(peaks, axis=0), universe - peaks
@@ -192,18 +158,9 @@ def memberships(universe: Curve, terms: Terms) -> Curve:
 
 def infer(x: Curve, system: FuzzySystem) -> Curve:
     """
-    Mamdani inference: minimum, maximum, centroid; singletons: their weighted mean.
+    Return the crisp outputs, not normalised, of K inputs within [-1, 1].
 
-    Parameters
-    ----------
-    x : (K,) array
-        Inputs within [-1, 1].
-
-    Returns
-    -------
-    (K,) array
-        The crisp outputs, not normalised.
-
+    Mamdani inference: minimum, maximum, centroid; of singletons their weighted mean.
     """
     activations, rules = memberships(x, system.inputs), list(system.rules)
     if system.outputs.shape == SINGLETON:
@@ -229,24 +186,10 @@ def _centroid(y: Curve) -> Any:
 @lru_cache(maxsize=32)
 def curve(text: str) -> Curve:
     """
-    Return psi at `KNOTS` evenly spaced points of [0, 1] (it is odd), read-only.
+    Return psi of a text at `KNOTS` evenly spaced points of [0, 1] (it is odd), read-only.
 
-    Parameters
-    ----------
-    text : str
-        See `read_system`.
-
-    Returns
-    -------
-    (KNOTS,) array
-        0 at 0, non-decreasing, 1 at 1: a centroid alone ends at about 0.83 (5 terms), which would
-        cut every gain.
-
-    Raises
-    ------
-    ConfigurationError
-        The text is no system, or its curve falls, stays 0, or leaves [-1, 1].
-
+    It is 0 at 0, does not fall, and is 1 at 1: a centroid alone ends at about 0.83 (5 terms),
+    which would cut every gain. Raises ConfigurationError where that can't be.
     """
     x, system = np.linspace(0.0, 1.0, KNOTS), read_system(text)
     if isinstance(system, FuzzySystem):

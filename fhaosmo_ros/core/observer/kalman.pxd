@@ -17,7 +17,7 @@ cdef void correct(int n, Row* p, double variance) noexcept nogil
 cdef class LinearModel:
     cdef int n  # states
     cdef Row rates[MOST_LEVELS]  # A of x' = A x (1/s), a lower Hessenberg matrix
-    cdef double intensity  # of the white noise that drives the last state
+    cdef readonly double intensity  # of the white noise that drives the last state
     cdef readonly double fastest  # rate of the fastest motion (1/s)
     cdef void flow(self, double h, Row* f) noexcept nogil
     cdef void predict(self, Row* p, double h) noexcept nogil

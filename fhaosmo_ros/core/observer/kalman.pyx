@@ -165,29 +165,19 @@ def matern(rate, derivatives):
 
 class Uncertainty:
     """
-    What the covariance of an observer follows from, by parameters (D 20).
+    What the covariance of an observer follows from (D 20).
 
-    Parameters
-    ----------
-    model : TriangularModel
-    p : mapping
-        Parameters of the observer, with noise_size > 0.
-    sizes : (n,) array
-        Of the states.
+    `p` are parameters of the observer with noise_size > 0, `sizes` those of the n states.
+    ConfigurationError: the model has no finite slope at rest.
 
     Attributes
     ----------
     linear : LinearModel
         The model with D 17, linearised at rest.
-    variance, intensity : float
-        Of the noise on y; of the white noise that drives the last level.
+    variance : float
+        Of the noise on y.
     fresh : (N, N) array
         Covariance of the errors of a fresh observer.
-
-    Raises
-    ------
-    ConfigurationError
-        The model has no finite slope at rest.
 
     """
 
@@ -205,14 +195,14 @@ class Uncertainty:
         rates[:n, :n] += jacobian
         rates[range(n, levels), range(n, levels)] = -decay
         rate = decay or p['unknown_input_rate']
-        self.variance, self.intensity = p['noise_size'] ** 2, size**2 * matern(rate, k)
-        self.linear = LinearModel(rates, self.intensity)
+        self.variance = p['noise_size'] ** 2
+        self.linear = LinearModel(rates, size**2 * matern(rate, k))
         self.fresh = np.zeros((levels, levels))
         self.fresh[range(n), range(n)] = np.square(STATES_DOUBT * sizes)
         if p['start_from_measurement']:
             self.fresh[0, 0] = self.variance
         chain = np.eye(k + 1, k=1) - rate * np.eye(k + 1)
-        self.fresh[n:, n:] = INPUT_DOUBT**2 * stationary(chain, self.intensity)
+        self.fresh[n:, n:] = INPUT_DOUBT**2 * stationary(chain, self.linear.intensity)
 
     def steady(self, period):
         """
@@ -225,7 +215,7 @@ class Uncertainty:
         n, noise = len(self.fresh), math.sqrt(self.variance)
         steady = np.full((n, n), math.nan)
         with np.errstate(all='ignore'), suppress(ArithmeticError, np.linalg.LinAlgError):
-            speed = (self.intensity / (self.variance * period)) ** (0.5 / n)
+            speed = (self.linear.intensity / (self.variance * period)) ** (0.5 / n)
             unit = noise * speed ** np.arange(n)
             phi, q = self.linear.transition(period)
             a = (phi * unit[None, :] / unit[:, None]).T
@@ -245,7 +235,7 @@ class Uncertainty:
                 "parameters 'noise_size', 'unknown_input_size', 'unknown_input_rate', "
                 "'unknown_input_decay', 'correction_period', 'structure', 'phi': expected values "
                 'for which there is a Kalman filter in floating-point numbers, or noise_size = 0, '
-                f'got a noise of {noise:g} and an intensity of {self.intensity:g}'
+                f'got a noise of {noise:g} and an intensity of {self.linear.intensity:g}'
             )
         return steady
 
@@ -270,9 +260,7 @@ def innovations(Prediction prediction not None, samples, linear):
     prediction : Prediction
         Of N states.
     samples
-        With `h`, `y` of shape (K,): time since the sample before (s), sample; `periods` (K,): the
-        time in sampling periods, 0 where the filter begins afresh; `u` (K, m): known inputs;
-        `used` (K,): False for samples that do not correct.
+        With `h`, `y`, `periods`, `u`, `used`: see `Samples` of tools/tuning/identify.py.
     linear
         With `a`, `q`, `fresh` of shape (N, N): transition, added covariance of a period, and
         covariance where the filter begins; `variance` of the noise on y; `clip`:
@@ -281,10 +269,8 @@ def innovations(Prediction prediction not None, samples, linear):
 
     Returns
     -------
-    b, s : (K,) arrays
-        Innovations and their variances; NaN where the filter begins.
-    x : (K, N) array
-        Estimates.
+    (K,), (K,), (K, N) arrays
+        Innovations and their variances, NaN where the filter begins; estimates.
 
     """
     cdef const double[::1] h = samples.h

@@ -27,7 +27,6 @@ from fhaosmo_ros.core.observer.sliding_mode cimport (
 from fhaosmo_ros.core.observer.structure cimport Memory
 
 from fhaosmo_ros.core.observer.configuration import deadbeat_shares
-import numpy as np
 
 # An interval that differs from the tuned one by at most this part of it needs no other gains.
 cdef double NEAR = 0.25
@@ -85,12 +84,11 @@ cdef class Levant(SlidingMode):
             self.relaxation = speed / 3.0
         self.share = deadbeat_shares(n)
         self.correction_period = configuration.parameters['correction_period']
-        self.next_size = self.tuned_over_kalman = np.zeros(n)
+        self.tuned_over_kalman = configuration.tuned_over_kalman
+        self.next_size = configuration.next_sizes
         if self.scheduled:
             fill(self.steady, configuration.steady)
             self.steady_variance = self.steady[0][0] + self.noise_variance
-            self.tuned_over_kalman = configuration.tuned_over_kalman
-            self.next_size = configuration.next_sizes
 
     cdef void restart(self, double y) noexcept nogil:
         cdef Memory* memory = &self.memory

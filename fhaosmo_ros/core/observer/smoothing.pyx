@@ -116,7 +116,7 @@ cdef class Passes:
         elif p['noise_size'] > 0.0 and p['unknown_input']:
             its = Uncertainty(model, p, configuration.state_sizes)
             self.fastest, self.fresh = its.linear.fastest, its.fresh
-            self.model = Model(its.variance, its.intensity, 0.0, self.n - 1 - self.order)
+            self.model = Model(its.variance, its.linear.intensity, 0.0, self.n - 1 - self.order)
         else:
             raise ConfigurationError(
                 "smoothing: expected 'noise_size' > 0 (standard deviation of the noise on y; "
