@@ -35,11 +35,7 @@ def checked(values: Mapping[str, Any], like: Mapping[str, Any]) -> dict[str, Any
     """
     Return the numbers and arrays that `like` names, each of the type and shape that it has there.
 
-    Raises
-    ------
-    ConfigurationError
-        One is missing, of another type or shape, or out of its range.
-
+    Raises ConfigurationError where one is missing, of another type or shape, or out of its range.
     """
     found: dict[str, Any] = {}
     for name, value in like.items():

@@ -68,16 +68,9 @@ cdef inline void copy_levels(int count, const Level* source, Level* target) noex
 
 cdef class Structure:
     """
-    An observer of one output, whatever its structure.
+    An observer of one output, whatever its structure, from an `ObserverConfiguration`.
 
-    Parameters
-    ----------
-    configuration : ObserverConfiguration
-
-    Notes
-    -----
     Two threads can not use one at the same time: the second one gets a RuntimeError.
-
     """
 
     def __cinit__(self, configuration):
@@ -258,17 +251,16 @@ cdef class Structure:
 
     cdef void tell(self, double* model, double* tuning) noexcept nogil:
         """Write the likeliest model of d, and what has been found; only self-tuning has them."""
+        cdef int i
+        for i in range(7):
+            tuning[i] = NAN
 
     cdef bint jump(self, const double* u) noexcept nogil:
         """
         Go on with a y that alone has jumped (D 23).
 
-        Returns
-        -------
-        bool
-            False if that is not what happened: y differs from its prediction by no constant, or
-            the model says that the plant is now elsewhere. Then only `Memory.jumps` has changed.
-
+        Return False if that is not what happened: y differs from its prediction by no constant, or
+        the model says that the plant is now elsewhere. Then only `Memory.jumps` has changed.
         """
         cdef Memory* memory = &self.memory
         cdef double b = memory.miss, offset = memory.offset + b, total = memory.jumps + b
@@ -365,20 +357,13 @@ cdef class Structure:
         """What a self-tuning observer has found, (7,); NaN with fixed gains."""
         cdef double model[4]
         cdef double tuning[7]
-        cdef int i
-        for i in range(7):
-            tuning[i] = NAN
         self.tell(model, tuning)
-        return np.array([tuning[i] for i in range(7)])
+        return np.array(tuning)
 
     # Snapshots and copies
 
     def state_dict(self):
-        """
-        Return all that it remembers: name -> number, or array of one number a level.
-
-        `load_state_dict` takes it back.
-        """
+        """Return all that it remembers: name -> number, or array of one number a level."""
         cdef int n = self.levels
         cdef list levels = self.level
         cdef dict memory = self.memory
@@ -391,12 +376,8 @@ cdef class Structure:
         """
         Go on where an observer of the same size was.
 
-        Raises
-        ------
-        ConfigurationError
-            A number that is missing, of another size, not finite or out of its range. Then nothing
-            has changed.
-
+        Where a number is missing, of another size or out of its range it raises
+        ConfigurationError, and nothing has changed.
         """
         cdef int i, n = self.levels
         cdef dict memory = self.memory
@@ -468,13 +449,7 @@ def run(
     """
     Start with samples until one is good, step from the next one on; record the state after each.
 
-    Parameters
-    ----------
-    y, h : (K,) arrays
-        Samples, and the time (s) of the interval that ends at each.
-    u : (K, m) array
-        Known inputs of that interval.
-
+    `h` are the times (s) of the intervals that end at each sample, `u` the inputs of these.
     """
     cdef Record record = Record(structure, y.shape[0])
     cdef Py_ssize_t k
