@@ -2,10 +2,8 @@
 """
 The Kalman filter of a triangular model with a chain of integrators that makes d (D 17, D 20).
 
-Prediction and correction of a covariance P, its steady value, and the innovations of a recorded y:
-for the scheduled gains, the smoother and the identification of a recording. The self-tuning
-observer has 240 filters side by side and the same formulas with one more index
-(self_tuning/filters.pyx).
+For the scheduled gains, the smoother and the identification of a recording. The self-tuning
+observer has the same formulas with one more index (self_tuning/filters.pyx).
 """
 
 from libc.math cimport NAN, ceil, sqrt

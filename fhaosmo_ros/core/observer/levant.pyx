@@ -6,9 +6,6 @@ One innovation drives every level: eps = y - z_hat_1; gamma is held. Equations a
 numbers in docs/mathematics.md (D). The internal states mirror the estimates, z_tilde_{i+1} =
 z_hat_{i+1}, so that whatever reads a cascade's state reads this one; theta is 0.
 
-With `noise_size` the gains are scheduled: they are larger until the covariance P of the errors is
-steady (D 20). P also says which samples are unlikely (D 21).
-
 Levant 2003, doi:10.1080/0020717031000099029.
 """
 

@@ -1,11 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""
-What the two structures with fixed gains share: psi, the law of gamma, and the start.
-
-With `noise_size` they start as a Kalman filter: the covariance P of the errors follows the model,
-linearised at rest, with a Matern model of d (D 17, D 20). It begins with the sizes of the states,
-of d and of the noise that parameters tell.
-"""
+"""What the two structures with fixed gains share: psi, the law of gamma, and the start (D 20)."""
 
 from cython cimport final
 from libc.math cimport INFINITY, NAN, exp, fabs, isfinite, pow

@@ -337,11 +337,6 @@ cdef class Structure:
         estimate.unknown_input, estimate.gamma = self.estimate(self.order), self.memory.gamma
         return estimate
 
-    @property
-    def unknown_input(self):
-        """Estimate of d after the latest sample."""
-        return self.estimate(self.order)
-
     def forget(self):
         """Go back to the state before any sample."""
         self.enter()

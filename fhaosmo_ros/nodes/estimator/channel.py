@@ -120,7 +120,7 @@ class Channel:
             self._arrived, health.latest = True, now
             health.stamps.append(stamp)
             health.stepping += now - begin
-            health.d.append(estimator.policy.structure.unknown_input)
+            health.d.append(estimator.observer.estimate.unknown_input)
             if now >= self._outputs.due:
                 self._outputs.snapshot(Flag(0) if self._outputs.due else Flag.STARTED)
             if self.values['publish_on'] == 'sample':
