@@ -292,6 +292,7 @@ cdef class Passes:
         cdef Row known[MOST_LEVELS]  # X of D 34
         cdef Row a[MOST_LEVELS]  # of X <- A X A'
         cdef const Point* now = &rows[last]
+        cdef const Point* after
         cdef double total
         cdef Py_ssize_t k
         cdef int i, j, n = self.n
@@ -299,7 +300,7 @@ cdef class Passes:
         for i in range(n):
             costate[i] = 1.0 / sqrt(now.p[i][i]) if doubted and now.p[i][i] > 0.0 else 0.0
         for k in range(last, begin - 1, -1):
-            now = &rows[k]
+            after, now = now, &rows[k]
             total = 0.0 if doubted else now.pull
             for i in range(n):
                 total += now.certainty * now.p[0][i] * costate[i]
@@ -308,7 +309,7 @@ cdef class Passes:
                 for j in range(n):
                     total = 0.0
                     for i in range(n):
-                        a[i][j] = rows[k + 1].f[j][i]
+                        a[i][j] = after.f[j][i]
                         total += now.p[0][i] * a[i][j]
                     a[0][j] -= now.certainty * total
                 carry(n, a, known)
