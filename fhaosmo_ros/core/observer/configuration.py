@@ -143,17 +143,14 @@ class ObserverConfiguration:
 
     def _check_structure(self) -> None:
         p = self.parameters
-        needing = {
-            'gains': self.self_tuning, 'structure': p['structure'] == 'levant',
-            'unknown_input_derivatives': p['unknown_input_derivatives'] > 0,
-        }  # fmt: skip
-        for name, needs in needing.items():
-            if needs and not p['unknown_input']:
+        without = {'gains': 'fixed', 'structure': 'cascade', 'unknown_input_derivatives': 0}
+        for name, value in without.items():
+            if p[name] != value and not p['unknown_input']:
                 raise ConfigurationError(
                     f"parameters '{name}', 'unknown_input': {name} = {p[name]} needs levels of "
                     'the unknown input, expected unknown_input = true, got false'
                 )
-        cascade = p['structure'] == 'cascade' and not self.self_tuning
+        cascade = p['gains'] == 'fixed' and p['structure'] == 'cascade'
         if cascade and p['scheme'] == 'predict_correct':
             raise ConfigurationError(
                 "parameters 'scheme', 'structure': expected scheme = 'explicit' or 'implicit' "
