@@ -30,9 +30,8 @@ from fhaosmo_ros.core.parameters.tables import OBSERVER_PARAMETERS
 from fhaosmo_ros.core.simulation.metrics import rms
 from fhaosmo_ros.tools.cli.command import shipped
 from fhaosmo_ros.tools.tuning.identify import Samples
-from fhaosmo_ros.tools.tuning.objective import SMALLEST, TUNE_PARAMETERS
 from fhaosmo_ros.tools.tuning.search import BAD, Dimension, minimise
-from fhaosmo_ros.tools.tuning.tuner import DERIVATIVES, RATES, Tuner
+from fhaosmo_ros.tools.tuning.tuner import DERIVATIVES, RATES, SMALLEST, TUNE_PARAMETERS, Tuner
 import numpy as np
 from scipy.linalg import solve_discrete_are
 from studies import harness

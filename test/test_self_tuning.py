@@ -7,7 +7,7 @@ from fhaosmo_ros.core import Observer, OnlineEstimator, Plant, Status
 from fhaosmo_ros.core.model.triangular import TriangularModel
 from fhaosmo_ros.core.observer.self_tuning.intervals import within
 from fhaosmo_ros.core.simulation.metrics import rms
-from fhaosmo_ros.tools.tuning.objective import stamps_of
+from fhaosmo_ros.tools.tuning.tuner import stamps_of
 import numpy as np
 from observer_cases import discrete, matern, states_of
 import pytest

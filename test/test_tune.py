@@ -18,9 +18,8 @@ from fhaosmo_ros.core.simulation.metrics import rms
 from fhaosmo_ros.core.simulation.recordings import FAMILY_PARAMETERS
 from fhaosmo_ros.tools.tuning.command import main, read_parameters
 from fhaosmo_ros.tools.tuning.linear_gains import SCHEME
-from fhaosmo_ros.tools.tuning.objective import Objective, stamps_of, TUNE_PARAMETERS
 from fhaosmo_ros.tools.tuning.search import BAD, Dimension, minimise
-from fhaosmo_ros.tools.tuning.tuner import simulated, Tuner
+from fhaosmo_ros.tools.tuning.tuner import Objective, simulated, stamps_of, TUNE_PARAMETERS, Tuner
 import numpy as np
 import pytest
 from studies.methods import estimates, SampledModel
