@@ -200,87 +200,69 @@ TRIED = (0, 1, 2, 3)  # derivatives of d
 GRID = len(DERIVATIVES) * len(RATES)  # trials that `tune` uses before its search
 
 
-class SampledModel:
-    """
-    The model, linearised at rest and extended by a chain of integrators that makes d.
-
-    States are scaled by powers of the period (s), because the Riccati equation is badly
-    conditioned otherwise. With a `chain` of 1 white noise drives d itself, with 2 its derivative.
-    All states of the chain decay at the rate `decay` (1/s), so that d is a Matern process.
-    """
-
-    def __init__(
-        self, model: TriangularModel, period: float, chain: int = 1, decay: float = 0.0
-    ) -> None:
-        n, self.size, self.period = model.order, model.order + chain, period
-        self.scale = period ** np.arange(self.size)  # scaled states are x_i * period^(i - 1)
-        self._rates = np.eye(self.size, k=1)
-        self._rates[range(n, self.size), range(n, self.size)] = -decay
-        jacobian = model.jacobian(np.zeros(n))
-        fastest = np.max(np.abs(np.linalg.eigvals(jacobian + np.eye(n, k=1))))
-        resolution = min(0.03 / max(float(fastest), 1e-9), LONGEST_STEP)
-        # Runge-Kutta steps (s) up to this one have a negligible error. For a linear model steps of
-        # 0.1 / fastest rate would do; a nonlinearity that is crossed within a few steps, such as
-        # dry friction, needs shorter ones.
-        self.longest = min(LONGEST * period, resolution)
-        self._rates[:n, :n] += jacobian
-
-    def kalman(self, intensity: float) -> Floats:
-        """
-        Return the steady-state Kalman gain for noise of variance 1 on y.
-
-        It is for a filter that predicts to t_k and then corrects with y_k itself; white noise of
-        the intensity drives the last state of the chain.
-        """
-        rates = self._rates * self.scale[:, None] / self.scale[None, :]
-        a, noise = harness.discretised(rates, self.size - 1, self.period)
-        noise = 0.5 * intensity * self.scale[-1] ** 2 * (noise + noise.T)
-        try:
-            with np.errstate(invalid='ignore'):  # the result is checked below
-                p = solve_discrete_are(a.T, np.eye(self.size)[:1].T, noise, np.eye(1))
-        except (np.linalg.LinAlgError, ValueError) as error:
-            raise ConfigurationError(f'Kalman gain: no solution ({error})') from None
-        gain = p[:, 0] / (p[0, 0] + 1.0) / self.scale
-        if not np.isfinite(gain).all():
-            raise ConfigurationError(f'Kalman gain: expected finite numbers, got {gain}')
-        return gain
-
-
-def samples_of(r: Recording, model: TriangularModel) -> Samples:
-    """Return the samples of a recording, as if each came one period after the one before."""
-    count = len(r.y)
-    periods, used = np.ones(count, np.int64), np.ones(count, np.bool_)
-    periods[0] = 0  # there a filter begins
-    u = known_inputs(r.u, model.inputs, count)
-    return Samples(np.diff(r.t, prepend=r.t[0]), periods, np.ascontiguousarray(r.y), u, used)
-
-
-def estimates(
-    model: TriangularModel, gain: Floats, decay: float, r: Recording, longest: float
+def steady_gain(
+    model: TriangularModel, period: float, bandwidth: float, decay: float, derivatives: int
 ) -> Floats:
     """
-    Return the estimates of z, d, d_1, .. of a recording, a row for each sample, by the gain K.
+    Return the gain K, (N,), of the filter that predicts to t_k and then corrects with y_k itself.
 
-    `decay` is 0 for a random walk; intervals beyond `longest` (s) take several steps. This is a
-    Kalman filter whose covariance P is as it has to be for K from the beginning, and stays.
+    The model is linearised at rest; behind it d and its derivatives decay at the rate `decay`
+    (1/s), 0 for a random walk, and white noise drives the last of them, as intense as makes
+    `bandwidth` (rad/s) about that of the filter. States are scaled by powers of the period (s),
+    because the Riccati equation is badly conditioned otherwise.
     """
-    expressions, size = model.with_unknown_input(decay, len(gain) - model.order - 1), len(gain)
+    n, size = model.order, model.order + 1 + derivatives
+    rates = np.eye(size, k=1)
+    rates[range(n, size), range(n, size)] = -decay
+    rates[:n, :n] += model.jacobian(np.zeros(n))
+    scale = period ** np.arange(size)  # scaled states are x_i * period^(i - 1)
+    a, noise = harness.discretised(rates * scale[:, None] / scale[None, :], size - 1, period)
+    intensity = period * bandwidth ** (2 * size)  # for noise of variance 1 on y
+    noise = 0.5 * intensity * scale[-1] ** 2 * (noise + noise.T)
+    try:
+        with np.errstate(invalid='ignore'):  # the result is checked below
+            p = solve_discrete_are(a.T, np.eye(size)[:1].T, noise, np.eye(1))
+    except (np.linalg.LinAlgError, ValueError) as error:
+        raise ConfigurationError(f'Kalman gain: no solution ({error})') from None
+    gain = p[:, 0] / (p[0, 0] + 1.0) / scale
+    if not np.isfinite(gain).all():
+        raise ConfigurationError(f'Kalman gain: expected finite numbers, got {gain}')
+    return gain
+
+
+def _steady(setting: Setting, values: Values) -> Run:
+    """
+    Return a run of the filter whose speed is about `bandwidth`.
+
+    It takes samples as if each came one period after the one before; its covariance P is as it has
+    to be for the gain from the beginning, and stays.
+    """
+    model, period, decay = setting.model, setting.period, values.get('decay', 0.0)
+    n, derivatives = model.order, int(values.get('derivatives', 0))
+    gain = steady_gain(model, period, values['bandwidth'], decay, derivatives)
+    size, expressions = len(gain), model.with_unknown_input(decay, derivatives)
     fresh = np.zeros((size, size))
     fresh[:, 0] = gain  # K = P_1 / (P_11 + variance)
     steady = SimpleNamespace(
         a=np.eye(size), q=np.zeros((size, size)), fresh=fresh, variance=1.0 - gain[0],
         clip=math.inf, settled=0,
     )  # fmt: skip
-    _, _, found = innovations(Prediction(expressions, longest), samples_of(r, model), steady)
-    return np.asarray(found)
+    # Runge-Kutta steps (s) up to this one have a negligible error. For a linear model steps of
+    # 0.1 / fastest rate would do; a nonlinearity that is crossed within a few steps, such as dry
+    # friction, needs shorter ones.
+    rates = model.jacobian(np.zeros(n)) + np.eye(n, k=1)
+    fastest = float(np.max(np.abs(np.linalg.eigvals(rates))))
+    longest = min(LONGEST * period, 0.03 / max(fastest, 1e-9), LONGEST_STEP)
 
+    def run(r: Recording) -> Floats:
+        count = len(r.y)
+        periods, used = np.ones(count, np.int64), np.ones(count, np.bool_)
+        periods[0] = 0  # there the filter begins
+        u, h = known_inputs(r.u, model.inputs, count), np.diff(r.t, prepend=r.t[0])
+        samples = Samples(h, periods, np.ascontiguousarray(r.y), u, used)
+        return innovations(Prediction(expressions, longest), samples, steady)[2][:, : n + 1]
 
-def _steady(setting: Setting, values: Values) -> Run:
-    """Return a run of the filter whose speed is about `bandwidth`."""
-    model, decay = setting.model, values.get('decay', 0.0)
-    sampled = SampledModel(model, setting.period, 1 + int(values.get('derivatives', 0)), decay)
-    gain = sampled.kalman(setting.period * values['bandwidth'] ** (2 * sampled.size))
-    return lambda r: estimates(model, gain, decay, r, sampled.longest)[:, : model.order + 1]
+    return run
 
 
 def matern_space(setting: Setting, derivatives: int = 0) -> tuple[Dimension, ...]:

@@ -74,14 +74,14 @@ cdef class Joint(Dynamics):
             self.state.level[0].z_hat = self.state.z[0]
         self.state.gamma = observer.memory.gamma
 
-    cdef void rates(self, int stage, double t, const double* x, double* slope) noexcept nogil:
+    cdef void rates(self, double t, const double* x, double* slope) noexcept nogil:
         """Write the rates of plant, levels and gamma."""
         cdef const State* now = <const State*>x
         cdef State* rate = <State*>slope
         cdef Level* after
         cdef int i
         memset(rate, 0, self.size * sizeof(double))
-        self.plant.rates(stage, t, now.z, rate.z)
+        self.plant.rates(t, now.z, rate.z)
         # A forward Euler step of length 1 moves the levels by their rates.
         memcpy(self.observer.level, now.level, self.observer.levels * sizeof(Level))
         self.observer.memory.gamma, self.observer.memory.y = now.gamma, now.z[0]

@@ -73,16 +73,8 @@ def parse(
     """
     Parse Phi_level, which may use z1 .. z<level>, known inputs and constants by their names.
 
-    Returns
-    -------
-    list of (int, float)
-        Operations in postfix order; empty for an expression that is the constant 0.
-
-    Raises
-    ------
-    ConfigurationError
-        Anything that is not on the whitelist, or more work than the limits above allow.
-
+    Return operations in postfix order, none for an expression that is the constant 0. Raises
+    ConfigurationError for anything that is not on the whitelist, or exceeds the limits above.
     """
     parser = _Parser(text, level, inputs, constants)
     if len(text) > MAX_LENGTH:

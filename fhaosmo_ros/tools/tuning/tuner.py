@@ -18,7 +18,7 @@ from typing import Any
 from fhaosmo_ros.core.observer.configuration import FIXED_GAMMA, of_level
 from fhaosmo_ros.core.observer.observer import Observer
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
-from fhaosmo_ros.core.parameters.declaration import Parameter, Parameters, ParameterTable
+from fhaosmo_ros.core.parameters.declaration import Parameters, ParameterTable
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.tables import (
     ESTIMATOR_PARAMETERS,
@@ -26,7 +26,12 @@ from fhaosmo_ros.core.parameters.tables import (
     ONLINE_PARAMETERS,
 )
 from fhaosmo_ros.core.simulation.metrics import rms
-from fhaosmo_ros.core.simulation.recordings import Family, FAMILY_PARAMETERS, Recording
+from fhaosmo_ros.core.simulation.recordings import (
+    Family,
+    FAMILY_PARAMETERS,
+    fixed,
+    Recording,
+)
 from fhaosmo_ros.tools.cli.command import progress
 from fhaosmo_ros.tools.tuning.linear_gains import (
     chosen_otherwise,
@@ -42,17 +47,15 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 TUNING = (
-    Parameter('recordings', 36, 'Number of recordings that the search sees.', lower=1,
-              upper=10_000, live=False),
-    Parameter('held_out', 36,
-              'Number of other recordings, with other seeds, that only the report sees.', lower=1,
-              upper=10_000, live=False),
-    Parameter('settled', 5.0, 'Errors count from this time of a recording on.', unit='s',
-              lower=0.0, upper=1e5, live=False),
-    Parameter('weights', [1.0],
-              'Weight of the error of each estimate, squared and relative to the RMS of its '
-              'truth.', lower=0.0, upper=1e9, live=False,
-              lengths='1 (d alone) or n + 1 (z1 .. zn, d)'),
+    fixed('recordings', 36, 'Number of recordings that the search sees.', lower=1, upper=10_000),
+    fixed('held_out', 36,
+          'Number of other recordings, with other seeds, that only the report sees.', lower=1,
+          upper=10_000),
+    fixed('settled', 5.0, 'Errors count from this time of a recording on.', unit='s', lower=0.0,
+          upper=1e5),
+    fixed('weights', [1.0],
+          'Weight of the error of each estimate, squared and relative to the RMS of its truth.',
+          lower=0.0, upper=1e9, lengths='1 (d alone) or n + 1 (z1 .. zn, d)'),
 )  # fmt: skip
 TUNE_PARAMETERS = ParameterTable(FAMILY_PARAMETERS.values(), FAMILY_PARAMETERS.families, TUNING)
 """All that `tune` takes beside the estimator's parameters."""
