@@ -82,25 +82,11 @@ class Setting(NamedTuple):
         return fastest if self.noise <= 0.0 else min(self.balance(0), fastest)
 
     def balance(self, derivatives: int) -> float:
-        """
-        Return the bandwidth (rad/s) at which noise weighs as much as d, for N levels.
-
-        Noise of density noise^2 period leaves noise sqrt(period w^(2 N - 1)) in the N-th level.
-        Without any there is rounding.
-        """
+        """Return the bandwidth (rad/s) at which noise, or else rounding, weighs as much as d."""
         levels = self.model.order + 1 + derivatives
+        # Noise of density noise^2 period leaves noise sqrt(period w^(2 N - 1)) in level N.
         ratio = self.size / (max(self.noise, ROUNDING) * self.period**0.5)
         return float(min(ratio ** (1.0 / (levels - 0.5)), DEADBEAT / self.period))
-
-
-class Search(NamedTuple):
-    """What a method is tuned with."""
-
-    judged: Callable[[Values], float]  # from values to the objective over all recordings
-    setting: Setting
-    recordings: Sequence[Recording]
-    trials: int  # how often an objective may be evaluated
-    seed: int
 
 
 class Method(NamedTuple):
@@ -112,7 +98,8 @@ class Method(NamedTuple):
     """Raises ConfigurationError for values that make no observer."""
     space: Callable[[Setting], Sequence[Dimension]] = lambda _: ()
     """Parameters to tune for a setting."""
-    tune: Callable[[Search], Values] | None = None  # a search of its own
+    tune: Callable[..., Values] | None = None
+    """A search of its own: from objective, setting, recordings, trials and seed."""
 
 
 class Outcome(NamedTuple):
@@ -167,7 +154,7 @@ def tune(
 
     space, values = method.space(setting), {}
     if method.tune is not None:
-        values = dict(method.tune(Search(judged, setting, recordings, trials, seed)))
+        values = dict(method.tune(judged, setting, recordings, trials, seed))
     elif len(space) == 1:
         values = _scan(judged, space[0], trials)
     elif space:
@@ -196,7 +183,6 @@ LINEAR_LIMIT = 'Kalman, Matern'  # our observer equals this filter for small inn
 REACH = 10.0  # how far a search for the bandwidth goes, as a factor to both sides
 LONGEST, LONGEST_STEP = 1.5, 1.0
 """Steps of a prediction: nominal periods; seconds, for a model without dynamics of its own."""
-TRIED = (0, 1, 2, 3)  # derivatives of d
 GRID = len(DERIVATIVES) * len(RATES)  # trials that `tune` uses before its search
 
 
@@ -274,16 +260,18 @@ def matern_space(setting: Setting, derivatives: int = 0) -> tuple[Dimension, ...
     )
 
 
-def each_order(search: Search) -> Values:
+def each_order(
+    judged: Callable[[Values], float], setting: Setting, _: object, trials: int, seed: int
+) -> Values:
     """Search bandwidth and decay with each number of derivatives of d."""
     best: tuple[float, Values] = (math.inf, {})
-    for k in TRIED:
+    for k in DERIVATIVES:
         fixed = {'derivatives': float(k)}
         found = minimise(
-            lambda v, fixed=fixed: search.judged(fixed | v),
-            matern_space(search.setting, k),
-            max(1, search.trials // len(TRIED)),
-            search.seed,
+            lambda v, fixed=fixed: judged(fixed | v),
+            matern_space(setting, k),
+            max(1, trials // len(DERIVATIVES)),
+            seed,
         )
         if not best[1] or found.best_value < best[0]:
             best = found.best_value, fixed | found.best_params
@@ -295,7 +283,7 @@ def _online(own: Values, setting: Setting, values: Values) -> Run:
     parameters = setting.told | dict(values) | dict(own)
 
     def estimate(r: Recording) -> Floats:
-        found = harness.observed(parameters, r.t, r.y, r.u)
+        found = harness.observed(parameters, r)
         return np.column_stack([found.z, found.unknown_input])
 
     return estimate
@@ -309,12 +297,14 @@ def _papers(variant: str) -> dict[str, Any]:
     return kept | {name: kept[name][:1] for name in ('lambda', 'alpha')} | {'variant': variant}
 
 
-def _tune(search: Search) -> Values:
+def _tune(
+    _: object, setting: Setting, recordings: Sequence[Recording], trials: int, seed: int
+) -> Values:
     """Return the parameters of the estimator that `tune` writes; its grid uses trials, too."""
-    tuning = TUNE_PARAMETERS.complete(search.setting.told | {'settled': JUDGED_FROM})
+    tuning = TUNE_PARAMETERS.complete(setting.told | {'settled': JUDGED_FROM})
     with redirect_stderr(StringIO()):  # its progress bars
-        tuner = Tuner(list(search.recordings), {}, tuning, search.seed)
-        return tuner.parameters(tuner.search(max(1, search.trials - GRID)).best_params)
+        tuner = Tuner(list(recordings), {}, tuning, seed)
+        return tuner.parameters(tuner.search(max(1, trials - GRID)).best_params)
 
 
 def _one_bandwidth(s: Setting) -> Sequence[Dimension]:

@@ -120,8 +120,8 @@ RECIPE = Recipe(
     {
         'momentum observer': Method(momentum_observer, BANDWIDTHS),
         'Kalman filter, d a random walk': Method(partial(torque, kalman_filter), BANDWIDTHS),
-        FIXED: Method(partial(torque, judging.fixed), BANDWIDTHS),
-        OURS: Method(partial(torque, judging.self_tuning)),
+        FIXED: Method(partial(torque, judging.this_observer), BANDWIDTHS),
+        OURS: Method(partial(torque, judging.this_observer)),
     },
     conditions, 'torque at the shoulder [N m]', ('momentum observer', FIXED, OURS),
     (0.5, 4.7), band=False, data='bag of the pendubot',

@@ -136,7 +136,7 @@ def _of_search(
         f'{finished(study)} trials on {len(training)} simulated recordings; '
         f'{len(held_out)} others, held out, took no part in the search.'
     )
-    return tuned, f'{text}\n\n{table(columns, rows)}'
+    return tuned, f'{text}\n\n{markdown(columns, rows)}'
 
 
 def _of_bag(path: Path, estimator: dict[str, Any], tuning: dict[str, Any]) -> Found:
@@ -173,7 +173,7 @@ def _of_bag(path: Path, estimator: dict[str, Any], tuning: dict[str, Any]) -> Fo
         ('probability that innovations are white (Ljung-Box)', f'{white[1]:.2g}'),
     ]
     told = [f'Note: {text}' for text in notes(found, *white)]
-    text = '\n\n'.join([table(['found in y', ''], rows), *told])
+    text = '\n\n'.join([markdown(['found in y', ''], rows), *told])
     return ESTIMATOR_PARAMETERS.part_of(parameters), text
 
 
@@ -209,7 +209,7 @@ def notes(found: Identification, correlation: float, probability: float) -> Iter
         )
 
 
-def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+def markdown(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     """Return a Markdown table."""
     lines = [head, ['---'] * len(head), *rows]
     return '\n'.join(f'| {" | ".join(cells)} |' for cells in lines)
