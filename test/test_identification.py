@@ -2,7 +2,7 @@
 """What `tune` finds in a y without the truth (D 30), and when it refuses."""
 
 import bag_files as files
-from fhaosmo_ros.core import ConfigurationError, Family, Observer, OnlineEstimator, TriangularModel
+from fhaosmo_ros.core import ConfigurationError, Family, Observer, OnlineEstimator
 from fhaosmo_ros.core.parameters.files import load
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
 from fhaosmo_ros.core.simulation.metrics import rms
@@ -35,8 +35,7 @@ def noise():
 def found_in(y, phi=PHI, **given):
     given = {'order': len(phi), 'phi': list(phi)} | given
     values = ESTIMATOR_PARAMETERS.complete(given)
-    model = TriangularModel.of(values)
-    found = identify.Identification((T, y, np.zeros((K, 1))), model, values, given)
+    found = identify.Identification((T, y, np.zeros((K, 1))), values, given)
     return found, *found.gains()
 
 

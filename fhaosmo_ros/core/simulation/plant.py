@@ -59,11 +59,7 @@ class Plant:
         """
         Change live parameters from now on; all or nothing.
 
-        Raises
-        ------
-        ConfigurationError
-            An unknown name, a bad value, or a parameter that can't change live.
-
+        Raises ConfigurationError for an unknown name, a bad value, or one that can't change live.
         """
         self.adopt(self.prepare(changes), 'noise_seed' in changes)
 
@@ -85,11 +81,7 @@ class Plant:
         """
         Integrate up to the time `t` (s since the start), with known inputs (m,) held.
 
-        Raises
-        ------
-        ConfigurationError
-            A time that is not finite, or another number of inputs.
-
+        Raises ConfigurationError for a time that is not finite, or another number of inputs.
         """
         self._system.advance(t, known_inputs(u, self.model.inputs)[np.newaxis])
 

@@ -150,15 +150,14 @@ def _of_bag(path: Path, estimator: dict[str, Any], tuning: dict[str, Any]) -> Fo
     given = ParameterTable(MODEL).part_of(tuning) | estimator
     values = ESTIMATOR_PARAMETERS.complete(given)
     given |= {name: values[name] for name in ('order', 'phi')}
-    model = TriangularModel.of(values)
     with BagReader(path) as reader:
-        inputs = BagInputs(reader, values, model)
+        inputs = BagInputs(reader, values, TriangularModel.of(values))
         samples, field = inputs.samples()
         if field.wraps:
             samples = samples.unwrapped()
         u = inputs.at(samples)
     t = (samples.stamps - samples.stamps[0]) * 1e-9
-    found = Identification((t, samples.values, u), model, values, given)
+    found = Identification((t, samples.values, u), values, given)
     best, (parameters, expected) = found.best, found.gains()
     size, white = found.size_of_input(best.design, best.noise), found.whiteness()
     seconds, share = found.samples.h.sum(), expected[-1] / size

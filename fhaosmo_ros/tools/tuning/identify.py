@@ -105,7 +105,6 @@ class Identification:
     def __init__(
         self,
         recorded: Recorded,
-        model: TriangularModel,
         values: Parameters,
         given: Mapping[str, Any],
     ) -> None:
@@ -120,7 +119,8 @@ class Identification:
                 'can be learned from it. Record while the plant moves'
             )
         h = np.diff(t, prepend=t[0])
-        self.model, self._given = model, given
+        model = self.model = TriangularModel.of(values)
+        self._given = given
         self.period = period = float(np.median(h[1:]))
         periods = np.maximum(np.round(h / period), 1.0).astype(np.int64)
         periods[h > max(values['max_gap'] or GAP_SAMPLES * period, 3.0 * period)] = periods[0] = 0
