@@ -31,13 +31,10 @@ CASE = {'variant': 'fuzzy_adaptive', 'scheme': 'explicit', 'fuzzy_widths': [0.1]
 """Wide fuzzy sets: no chatter, so that rounding does not grow and both end at the same state."""
 BAR, CALL_BAR = 1.1, 0.6  # times C; microseconds of a call of `Observer.step`
 VARIANTS, SCHEMES = ('sign', 'fuzzy', 'fuzzy_adaptive'), ('explicit', 'implicit')
-SELF_TUNING_BARS = {'paper_plant': 12.0, 'dc_motor': 12.0, 'pendulum': 100.0}
-"""Microseconds a step, of files in config/models."""
+SELF_TUNING_BARS = {'paper_plant': 12.0, 'dc_motor': 12.0, 'pendulum': 100.0}  # us a step
 NOISE = 1e-4  # of y, where the file has no quantum
-PARTS = ('z_hat', 'z_tilde', 'p', 'q', 'gamma', 'y', 'pending')
-"""What a cascade remembers, in the order of the state of reference.c."""
-LAW = ('rate', 'min', 'max', 'dead_zone', 'leakage')
-"""Parameters of gamma at the end of its law there."""
+PARTS = ('z_hat', 'z_tilde', 'p', 'q', 'gamma', 'y', 'pending')  # of a state in reference.c
+LAW = ('rate', 'min', 'max', 'dead_zone', 'leakage')  # parameters of gamma, at the end of its law
 
 
 def measure(quick: bool) -> list[Row]:

@@ -58,7 +58,6 @@ def run_study(
     name: str,
     description: str | None,
     measure: Callable[[argparse.Namespace, Results], Found],
-    argv: list[str] | None = None,
     options: Iterable[tuple[str, dict[str, Any]]] = (),
 ) -> int:
     """
@@ -89,7 +88,7 @@ def run_study(
         found = measure(arguments, lambda calls: called(calls, name, arguments.jobs, stop))
         evidence.publish(arguments.output, *found)
 
-    return run_command(parser, argv, body)
+    return run_command(parser, None, body)
 
 
 def called(calls: Mapping[Hashable, Call], name: str, jobs: int, stop: Stop) -> dict[Any, Any]:

@@ -75,12 +75,6 @@ class Setting(NamedTuple):
         """The model, as parameters of an estimator."""
         return {'order': self.model.order, 'phi': list(self.model.phi)}
 
-    @property
-    def speed(self) -> float:
-        """Where searches begin: the bandwidth (rad/s) at which noise weighs as much as d."""
-        fastest = 0.5 / self.period
-        return fastest if self.noise <= 0.0 else min(self.balance(0), fastest)
-
     def balance(self, derivatives: int) -> float:
         """Return the bandwidth (rad/s) at which noise, or else rounding, weighs as much as d."""
         levels = self.model.order + 1 + derivatives
@@ -309,7 +303,7 @@ def _tune(
 
 def _one_bandwidth(s: Setting) -> Sequence[Dimension]:
     """Return a range in rad/s, from far below any d to where the observer is deadbeat."""
-    return [Dimension('bandwidth', 0.05, 5.0 / s.period, s.speed)]
+    return [Dimension('bandwidth', 0.05, 5.0 / s.period, min(s.balance(0), 0.5 / s.period))]
 
 
 PAPERS = {'sign': 'sign', 'fuzzy': 'fuzzy', 'adaptive': 'fuzzy_adaptive'}

@@ -22,8 +22,7 @@ from studies.harness import Floats, model_alone, observed, SELF_TUNING
 CONFIG = Path(__file__).resolve().parents[2] / 'config' / 'recipes'
 VELOCITY = 'velocity'  # a `quantity`
 OURS, FIXED = 'this observer, self-tuning', 'this observer, fixed gains'
-BUTTERWORTH = {2: (np.sqrt(2.0), 1.0), 3: (2.0, 2.0, 1.0)}
-"""Coefficients of Butterworth polynomials of degree N, without the first one."""
+BUTTERWORTH = {2: (np.sqrt(2.0), 1.0), 3: (2.0, 2.0, 1.0)}  # polynomials, but their first 1
 FAR = 1.0  # half-width of psi; smaller innovations are corrected linearly
 
 
@@ -92,11 +91,6 @@ def model(name: str, constants: Mapping[str, float] | None = None) -> dict[str, 
     return model_alone(p) | {f'constants.{k}': float(v) for k, v in (constants or {}).items()}
 
 
-def plant_of(parameters: Mapping[str, Any]) -> TriangularModel:
-    """Return the model that the estimator's parameters describe."""
-    return TriangularModel.of(ESTIMATOR_PARAMETERS.complete(parameters))
-
-
 def fixed_gains(order: int, bandwidth: float, period: float) -> dict[str, Any]:
     """Return the gains of a linear observer with Butterworth poles at a bandwidth (rad/s)."""
     shape = BUTTERWORTH[order + 1]
@@ -130,7 +124,7 @@ def disturbance_observer(p: Mapping[str, Any], r: Recorded, bandwidth: float) ->
     The low-passed second derivative less what the model explains (Chen et al. 2016,
     doi:10.1109/TIE.2015.2478397).
     """
-    model, h = plant_of(p), r.period
+    model, h = TriangularModel.of(ESTIMATOR_PARAMETERS.complete(p)), r.period
     velocity = low_passed(r.y, bandwidth, h, 2, 1)
     samples = zip(np.column_stack([r.y, velocity]), r.u, strict=True)
     explained = np.array([model.evaluate(z, u)[1] for z, u in samples])
@@ -145,7 +139,7 @@ def kalman_filter(p: Mapping[str, Any], r: Recorded, bandwidth: float) -> Floats
     Only the ratio of the two noises matters; it is given as the bandwidth of the steady filter of
     the chain of integrators: q = bandwidth^(2N) noise² h, N = n + 1.
     """
-    model = plant_of(p)
+    model = TriangularModel.of(ESTIMATOR_PARAMETERS.complete(p))
     n, h = model.order, r.period
     q = bandwidth ** (2 * n + 2) * h
     x = np.zeros(n + 1)
