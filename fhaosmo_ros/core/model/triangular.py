@@ -16,8 +16,8 @@ import sys
 from typing import Any
 import warnings
 
-from fhaosmo_ros.core.model import phi as codes
 from fhaosmo_ros.core.model.inputs import known_inputs
+import fhaosmo_ros.core.model.phi as codes
 from fhaosmo_ros.core.parameters.declaration import suggestion
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.tables import CONSTANTS
@@ -32,25 +32,18 @@ Operators and functions of one expression.
 An operator takes some 15 ns, a function up to 100 ns, and with its default step the plant
 evaluates every Phi 40,000 times in a simulated second.
 """
-ARGUMENTS = {
-    range(1, 2): 'one argument',
-    range(2, 3): 'two arguments',
-    range(2, MAX_LENGTH): 'two arguments or more',
-}
+ONE, TWO = (range(1, 2), 'one argument'), (range(2, 3), 'two arguments')
+MORE = range(2, MAX_LENGTH), 'two arguments or more'
 """How many arguments functions take, and how that is said."""
-ONE, TWO, MORE = ARGUMENTS
 FUNCTIONS = dict.fromkeys(
     ('sin', 'cos', 'tan', 'exp', 'log', 'sqrt', 'abs', 'tanh', 'sign'), ONE
 ) | {'atan2': TWO, 'min': MORE, 'max': MORE}  # fmt: skip
 NUMBERS = {'pi': math.pi}  # names of numbers
 KNOWN = [*FUNCTIONS, *NUMBERS]
 OPERATORS: dict[type[ast.operator], int] = {
-    ast.Add: codes.ADD,
-    ast.Sub: codes.SUB,
-    ast.Mult: codes.MUL,
-    ast.Div: codes.DIV,
+    ast.Add: codes.ADD, ast.Sub: codes.SUB, ast.Mult: codes.MUL, ast.Div: codes.DIV,
     ast.Pow: codes.POW,
-}
+}  # fmt: skip
 Operation = tuple[int, float]
 """A code of `phi`, and the index or the number that belongs to it."""
 
@@ -227,8 +220,8 @@ class _Parser:
             case ast.Call(func=ast.Name(id=name), args=arguments, keywords=[]):
                 if name not in FUNCTIONS:
                     raise self.error(f"unknown function '{name}'{suggestion(name, FUNCTIONS)}")
-                if len(arguments) not in FUNCTIONS[name]:
-                    needed = ARGUMENTS[FUNCTIONS[name]]
+                counts, needed = FUNCTIONS[name]
+                if len(arguments) not in counts:
                     raise self.error(f'{name} needs {needed}, got {len(arguments)}')
                 self.apply(getattr(codes, name.upper()), arguments)
             case _:
@@ -254,11 +247,10 @@ class _Parser:
         if name in self.names:
             return self.names[name]
         if name[:1] == 'z' and name[1:].isdigit() and int(name[1:]) > self.level:
-            raise self.error(
-                f'{name} comes after z{self.level}: the model would not be triangular'
-            )
+            after = f'z{self.level}: the model would not be triangular'
+            raise self.error(f'{name} comes after {after}')
         if name in FUNCTIONS:
-            raise self.error(f'{name} needs {ARGUMENTS[FUNCTIONS[name]]}')
+            raise self.error(f'{name} needs {FUNCTIONS[name][1]}')
         hint = suggestion(name, [*self.names, *KNOWN])
         raise self.error(
             f"unknown name '{name}'{hint}; 'inputs' declares known inputs and 'constants.{name}' "
