@@ -27,7 +27,6 @@ from fhaosmo_ros.tools.tuning.search import finished
 from fhaosmo_ros.tools.tuning.tuner import simulated, TUNE_PARAMETERS, Tuner
 import numpy as np
 
-TRIALS = 1000
 SMALL_CORRELATION, UNLIKELY = 0.05, 0.01
 BOTH = ParameterTable(
     TUNE_PARAMETERS.values(), ESTIMATOR_PARAMETERS.values(), ESTIMATOR_PARAMETERS.families
@@ -59,7 +58,7 @@ def main(argv: list[str] | None = None) -> int:
     )  # fmt: skip
     add = parser.add_argument_group('from simulated recordings').add_argument
     add(
-        '--trials', type=int, default=TRIALS, metavar='N',
+        '--trials', type=int, default=1000, metavar='N',
         help='that the study shall hold at the end (default: %(default)s)',
     )  # fmt: skip
     add('--jobs', type=int, metavar='N', help='trials at a time (default: one a core)')

@@ -83,23 +83,9 @@ class Identification:
 
     `values` are all parameters of the estimator; those that the user set are `given`, and
     `noise_size`, `unknown_input_derivatives` and `unknown_input_decay` among these are not
-    estimated. Raises ConfigurationError where there are no gains for this y, and says why.
-
-    Attributes
-    ----------
-    samples : Samples
-        Those that are usable.
-    period : float
-        Of sampling (s).
-    quantum : float
-        Of y; 0 for none that shows.
-    fixed : bool
-        The noise is given.
-    outliers : int
-        Samples that were left out.
-    best : Evaluation
-        Of the likeliest design.
-
+    estimated. `best` is the evaluation of the likeliest design on the usable `samples`, of which
+    `outliers` were left out. Raises ConfigurationError where there are no gains for this y, and
+    says why.
     """
 
     def __init__(
@@ -121,7 +107,7 @@ class Identification:
         h = np.diff(t, prepend=t[0])
         model = self.model = TriangularModel.of(values)
         self._given = given
-        self.period = period = float(np.median(h[1:]))
+        self.period = period = float(np.median(h[1:]))  # of sampling (s)
         periods = np.maximum(np.round(h / period), 1.0).astype(np.int64)
         periods[h > max(values['max_gap'] or GAP_SAMPLES * period, 3.0 * period)] = periods[0] = 0
         used = np.ones(count, dtype=bool)
@@ -137,11 +123,12 @@ class Identification:
             sizes.append(3.0 * rms(slow))
         self._sizes = np.array(sizes)
         # The noise: a smooth signal vanishes in differences of high order.
-        self.quantum = quantum(y)
+        self.quantum = quantum(y)  # 0 for none that shows
         self._rounding = self.quantum / math.sqrt(12.0)
         rough = float(median_abs_deviation(np.diff(y, 4), scale='normal')) / math.sqrt(70.0)
         guess = max(rough, self._rounding, 1e-9 * float(np.std(y)))
-        self._noise, self.fixed = given.get('noise_size') or guess, bool(given.get('noise_size'))
+        self.fixed = bool(given.get('noise_size'))  # else the noise is estimated, too
+        self._noise = given.get('noise_size') or guess
         self._clip = math.inf  # standard deviations, of the innovations by which it corrects
         with progress(unit='filter', desc='likelihood', leave=False) as self._bar:
             start = self._start()
@@ -203,8 +190,7 @@ class Identification:
 
     def _start(self) -> Evaluation:
         """Scan bandwidths, and bring the scale of clipping and the sizes about."""
-        speeds = FIRST / self.period
-        designs = [Design(1, float(speed), 0.5 * float(speed)) for speed in speeds]
+        designs = [Design(1, speed, 0.5 * speed) for speed in (FIRST / self.period).tolist()]
         best = max(map(self.evaluate, designs), key=lambda e: e.log_likelihood)
         self._clip = CLIP
         for _ in range(2):
