@@ -13,7 +13,7 @@ from time import process_time
 from timeit import repeat, timeit
 from typing import Any
 
-from fhaosmo_ros.core import Observer, Plant
+from fhaosmo_ros.core import Observer, OnlineEstimator, Plant
 from fhaosmo_ros.core.observer.configuration import ObserverConfiguration
 from fhaosmo_ros.core.observer.fuzzy import KNOTS
 from fhaosmo_ros.core.observer.status import LEVEL_SHIFT
@@ -21,22 +21,20 @@ from fhaosmo_ros.core.observer.structure import run as run_structure
 from fhaosmo_ros.core.parameters.files import load
 from fhaosmo_ros.core.parameters.tables import PLANT_PARAMETERS
 from fhaosmo_ros.tools.cli.command import shipped
+from fhaosmo_ros.tools.tuning.tuner import stamps_of
 import numpy as np
 from results import Row
-from studies.harness import model_alone, observed, SELF_TUNING
+from studies.harness import model_alone, SELF_TUNING
 
 PERIOD, BLOCK = 1e-3, 10_000  # seconds; samples that are recorded at a time, here and in C
 CASE = {'variant': 'fuzzy_adaptive', 'scheme': 'explicit', 'fuzzy_widths': [0.1]}
 """Wide fuzzy sets: no chatter, so that rounding does not grow and both end at the same state."""
 BAR, CALL_BAR = 1.1, 0.6  # times C; microseconds of a call of `Observer.step`
 VARIANTS, SCHEMES = ('sign', 'fuzzy', 'fuzzy_adaptive'), ('explicit', 'implicit')
-SELF_TUNING_BARS = {'paper_plant': 12.0, 'dc_motor': 12.0, 'pendulum': 100.0}
-"""Microseconds a step, of files in config/models."""
+SELF_TUNING_BARS = {'paper_plant': 12.0, 'dc_motor': 12.0, 'pendulum': 100.0}  # us a step
 NOISE = 1e-4  # of y, where the file has no quantum
-PARTS = ('z_hat', 'z_tilde', 'p', 'q', 'gamma', 'y', 'pending')
-"""What a cascade remembers, in the order of the state of reference.c."""
-LAW = ('rate', 'min', 'max', 'dead_zone', 'leakage')
-"""Parameters of gamma at the end of its law there."""
+PARTS = ('z_hat', 'z_tilde', 'p', 'q', 'gamma', 'y', 'pending')  # of a state in reference.c
+LAW = ('rate', 'min', 'max', 'dead_zone', 'leakage')  # parameters of gamma, at the end of its law
 
 
 def measure(quick: bool) -> list[Row]:
@@ -132,6 +130,8 @@ def _self_tuning(model: str, bar: float, length: int) -> Row:
     t = np.arange(round(length / PERIOD)) * PERIOD
     y = Plant(plant | noise).simulate(t).y
     told = model_alone(load(path, 'estimator')) | SELF_TUNING
-    spent = timeit(lambda: observed(told, t, y), timer=process_time, number=1)
+    begin = process_time()
+    OnlineEstimator(told).run(stamps_of(t), y)
+    spent = process_time() - begin
     note = f'{length} s at 1 kHz; {told["order"]} states'
     return Row(f'step, self-tuning, {model}', 1e6 * spent / len(y), 'us', bar, note)

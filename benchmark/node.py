@@ -3,14 +3,12 @@
 CPU, lost samples and latency of our nodes beside one that computes nothing; an estimator's start.
 
 This file is also what stands around the node: `node.py source NODE RATE JOINTS` publishes y, or
-the joint states of a robot arm in free motion, at an exact rate; sample k comes k periods after
-the first one, and a late one does not delay those behind it. It begins once it has two
-subscribers, and says at its end how many it has published.
+the joint states of a robot arm in free motion, at an exact rate: a late sample does not delay
+those behind it. It begins once it has two subscribers, and says at its end how many it has sent.
 
 `node.py empty_node NODE RATE JOINTS` has the node's subscription, timer and executor. It publishes
 messages that were made once, and the stamp of the latest sample, from which latencies are
-measured. What a node costs more than this is ours; what this costs is the middleware's. Of both
-the topics in `OUTPUTS` are heard: our nodes publish nothing else then.
+measured: what this costs is the middleware's. Of both the topics in `OUTPUTS` are heard.
 """
 
 from contextlib import ExitStack
@@ -26,6 +24,7 @@ from builtin_interfaces.msg import Time
 from fhaosmo_ros.core.arm.model import ArmModel
 from fhaosmo_ros.nodes.middleware.diagnostics import publish_diagnostics, Report
 from fhaosmo_ros.nodes.middleware.endpoints import SENSOR_QOS, subscribe_with_info
+from fhaosmo_ros.nodes.middleware.messages import time_message
 from fhaosmo_ros.nodes.middleware.spin import Spinner
 from live import Child, start_node, wait_until, Watch
 import numpy as np
@@ -239,8 +238,7 @@ def publish_samples(of: str, rate: float, joints: int, ended: threading.Event) -
         q, efforts = rows[count % len(rows)]
         if joints:
             message.position, message.effort = q, efforts
-            stamp = divmod(time_ns(), 1_000_000_000)
-            message.header.stamp.sec, message.header.stamp.nanosec = stamp
+            time_message(time_ns(), message.header.stamp)
         else:
             message.data = q[0]
         publisher.publish(message)
@@ -281,7 +279,7 @@ class EmptyNode(Node):
 
     def _publish(self) -> None:
         if self._latest:
-            self._stamp.sec, self._stamp.nanosec = divmod(self._latest, 1_000_000_000)
+            time_message(self._latest, self._stamp)
             for publish, message in self._outputs:
                 publish(message)
 

@@ -33,8 +33,7 @@ STAND_IN = 'chirp'  # shape that `Unseen` replaces
 STEP = 5e-4
 """Of the simulations, in seconds: Runge-Kutta steps whose error is far below any estimate's."""
 TRAINING_SEED, HELD_OUT_SEED, HELD_OUT = 1, 1001, 6
-FEW_SAMPLES, MORE = 300.0, 3
-"""Below this rate (Hz) the training has this many times the recordings."""
+FEW_SAMPLES, MORE = 300.0, 3  # below this rate (Hz) training has so many times the recordings
 
 
 class Disturbance(NamedTuple):

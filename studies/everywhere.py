@@ -182,7 +182,7 @@ def self_tuned(setting: Setting, recordings: list[Recording]) -> SelfTuned:
     """Run the self-tuning estimator, which is told only the model."""
     errors, inside, largest, since = [], [], 0.0, setting.judged_from
     for r in recordings:
-        found = observed(setting.told | SELF_TUNING, r.t, r.y)
+        found = observed(setting.told | SELF_TUNING, r)
         d = found.unknown_input
         errors.append(objective(r, d, since))
         away = np.abs(d - r.d) / found.standard_deviation[:, -1]
@@ -200,7 +200,7 @@ def cell(name: str, condition: str, size: Size, once: Values | None) -> tuple[Ro
     once = once or anew.values
     values = at(once, setting.model.order, c.rate)
     preset = load(shipped(plant.file), 'estimator', ONLINE_PARAMETERS) | setting.told
-    of_preset = (objective(r, observed(preset, r.t, r.y).unknown_input) for r in recordings)
+    of_preset = (objective(r, observed(preset, r).unknown_input) for r in recordings)
     ours = self_tuned(setting, recordings)
     found = {
         SELF: mean(ours.errors),

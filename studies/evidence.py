@@ -8,6 +8,7 @@ import re
 from typing import Any
 
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
+from fhaosmo_ros.tools.tuning.command import markdown as markdown  # for all studies
 from matplotlib.figure import Figure
 import numpy as np
 
@@ -55,27 +56,15 @@ def parts(document: str) -> dict[str, str]:
 
 
 def filled(document: str, texts: Mapping[str, str]) -> str:
-    """
-    Return the document with these parts replaced; others stay.
-
-    Raises
-    ------
-    ConfigurationError
-        The document has no markers of one of the names.
-
-    """
-    present = parts(document) | texts
-    if len(present) > len(parts(document)):
+    """Return the document with these parts replaced; others stay, and all must have markers."""
+    present = parts(document)
+    if not texts.keys() <= present.keys():
         raise ConfigurationError(
             f'markers of the document: expected {", ".join(sorted(texts))}, '
-            f'got {", ".join(sorted(parts(document))) or "none"}'
+            f'got {", ".join(sorted(present)) or "none"}'
         )
+    present |= texts
     return PATTERN.sub(lambda match: PART.format(match['name'], present[match['name']]), document)
-
-
-def markdown(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Return a table of the page."""
-    return '\n'.join(f'| {" | ".join(line)} |' for line in (head, ['---'] * len(head), *rows))
 
 
 def publish(
@@ -85,10 +74,9 @@ def publish(
     figures: Mapping[str, Figure],
 ) -> None:
     """
-    Write tables and figures into the folder beside the page, and fill the page if it is there.
+    Write tables and figures by name into the folder beside the page, and fill the page if there.
 
-    `docs` is the folder of the page, made where there is none; tables are lines by name of the
-    CSV, `texts` are generated parts of the page, figures are by name of the PNG.
+    `docs` is the folder of the page, made where there is none; `texts` are parts of the page.
     """
     page, folder = docs / PAGE, docs / FOLDER
     if page.exists():
@@ -115,10 +103,9 @@ def draw_ratios(
     text: str,
 ) -> Figure:
     """
-    Draw ratios of errors, a panel a plant: for the comparison, and for use everywhere.
+    Draw ratios of errors, which `text` describes, a panel a plant.
 
-    `panels` has them by title of the panel, row, and method; `styles` colour, marker and area by
-    method; `text` says what the ratio is.
+    `panels` has them by title of the panel, row, and method; `styles` are by method.
     """
     rows = list(dict.fromkeys(row for panel in panels.values() for row in panel))
     figure = Figure(figsize=(11.0, 0.3 * len(rows) + 1.6), layout='constrained')

@@ -5,7 +5,6 @@ import argparse
 from collections.abc import Callable, Hashable, Iterable, Mapping
 from concurrent.futures import ProcessPoolExecutor, wait
 import multiprocessing
-from multiprocessing import resource_tracker
 import os
 from pathlib import Path
 import signal
@@ -13,10 +12,12 @@ import threading
 from typing import Any, NamedTuple
 
 from fhaosmo_ros.core import OnlineEstimator, Trajectory
+from fhaosmo_ros.core.parameters.declaration import ParameterTable
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
-from fhaosmo_ros.core.parameters.tables import CONSTANTS
+from fhaosmo_ros.core.parameters.tables import MODEL
 from fhaosmo_ros.stop_signals import Stop, Stopped
 from fhaosmo_ros.tools.cli.command import progress, run_command
+from fhaosmo_ros.tools.tuning.tuner import stamps_of
 from matplotlib.figure import Figure
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +26,7 @@ from studies import evidence
 from studies.evidence import DOCS, Row
 
 SELF_TUNING = {'gains': 'self_tuning'}
-MODEL = ('order', 'phi', 'inputs')
+model_alone = ParameterTable(MODEL).part_of  # the parameters that self-tuning is told
 POLL = 0.1  # seconds between two looks at what has come
 Floats = NDArray[np.float64]
 Call = tuple[Any, ...]  # a function of a module, and its arguments
@@ -57,15 +58,13 @@ def run_study(
     name: str,
     description: str | None,
     measure: Callable[[argparse.Namespace, Results], Found],
-    argv: list[str] | None = None,
     options: Iterable[tuple[str, dict[str, Any]]] = (),
 ) -> int:
     """
     Run the command of a study: measure, and write what was found into a folder.
 
     `measure` gets the arguments, with the folder as `output`, and a function that computes calls
-    in several processes; `options` are arguments beside those that all studies have. Return 0; 2
-    for a bad argument or output; 130 if it was interrupted.
+    in several processes; `options` are arguments beside those that all studies have.
     """
     parser = argparse.ArgumentParser(prog=name, description=description)
     add = parser.add_argument
@@ -89,7 +88,7 @@ def run_study(
         found = measure(arguments, lambda calls: called(calls, name, arguments.jobs, stop))
         evidence.publish(arguments.output, *found)
 
-    return run_command(parser, argv, body)
+    return run_command(parser, None, body)
 
 
 def called(calls: Mapping[Hashable, Call], name: str, jobs: int, stop: Stop) -> dict[Any, Any]:
@@ -97,28 +96,15 @@ def called(calls: Mapping[Hashable, Call], name: str, jobs: int, stop: Stop) -> 
     Return the results of calls in several processes, by key, in order.
 
     The main process only waits, and a signal sets `stop`: nothing is raised in the middle of
-    anything, where a lock would stay locked or a library would make another error of it.
-
-    Raises
-    ------
-    Stopped
-        `stop` is set; the processes have ended.
-    BrokenProcessPool
-        A process ended, or could not load its call.
-
+    anything, where a lock would stay locked or a library would make another error of it. Raises
+    `Stopped` then, and BrokenProcessPool if a process ended, or could not load its call.
     """
     for variable in ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS'):
         os.environ.setdefault(variable, '1')  # the processes already use all cores
-    # Inherited: only this process takes signals, and ends the others.
-    signals = {signal.SIGINT, signal.SIGHUP}
-    mask = signal.pthread_sigmask(signal.SIG_BLOCK, signals)
-    resource_tracker.ensure_running()  # which unblocks SIGINT (Python 3.11), so once more
-    signal.pthread_sigmask(signal.SIG_BLOCK, signals)
     spawn = multiprocessing.get_context('spawn')
     with ProcessPoolExecutor(jobs, spawn, _end_with_parent) as pool:
         try:
             futures = {key: pool.submit(*call) for key, call in calls.items()}
-            signal.pthread_sigmask(signal.SIG_SETMASK, mask)
             waiting = set(futures.values())
             with progress(total=len(calls), unit='part', desc=name) as bar:
                 while waiting:
@@ -136,7 +122,9 @@ def called(calls: Mapping[Hashable, Call], name: str, jobs: int, stop: Stop) -> 
 
 
 def _end_with_parent() -> None:
-    """End this process once its parent has: a killed one does not end it."""
+    """End this process once its parent has, also a killed one; signals are for the parent."""
+    for number in (signal.SIGINT, signal.SIGHUP):
+        signal.signal(number, signal.SIG_IGN)
 
     def watch() -> None:
         multiprocessing.parent_process().join()
@@ -145,15 +133,8 @@ def _end_with_parent() -> None:
     threading.Thread(target=watch, daemon=True).start()
 
 
-def model_alone(parameters: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the parameters that are the model: what a self-tuning observer is told."""
-    return {k: v for k, v in parameters.items() if k in MODEL or k.startswith(CONSTANTS)}
-
-
-def observed(
-    parameters: Mapping[str, Any], t: Floats, y: Floats, u: Floats | None = None
-) -> Trajectory:
-    """Return what the node would have estimated from samples, the first one at t[0]."""
+def observed(parameters: Mapping[str, Any], r: Any) -> Trajectory:
+    """Return what the node would have estimated from t, y and u of a recording."""
     estimator = OnlineEstimator(parameters)
-    stamps = 10**9 + np.round((t - t[0]) * 1e9).astype(np.int64)
-    return estimator.run(stamps, y, u if estimator.observer.used_inputs else None)
+    u = r.u if estimator.observer.used_inputs else None
+    return estimator.run(stamps_of(r.t - r.t[0]), r.y, u)

@@ -30,9 +30,8 @@ from fhaosmo_ros.core.parameters.tables import OBSERVER_PARAMETERS
 from fhaosmo_ros.core.simulation.metrics import rms
 from fhaosmo_ros.tools.cli.command import shipped
 from fhaosmo_ros.tools.tuning.identify import Samples
-from fhaosmo_ros.tools.tuning.objective import SMALLEST, TUNE_PARAMETERS
 from fhaosmo_ros.tools.tuning.search import BAD, Dimension, minimise
-from fhaosmo_ros.tools.tuning.tuner import DERIVATIVES, RATES, Tuner
+from fhaosmo_ros.tools.tuning.tuner import DERIVATIVES, RATES, SMALLEST, TUNE_PARAMETERS, Tuner
 import numpy as np
 from scipy.linalg import solve_discrete_are
 from studies import harness
@@ -76,32 +75,12 @@ class Setting(NamedTuple):
         """The model, as parameters of an estimator."""
         return {'order': self.model.order, 'phi': list(self.model.phi)}
 
-    @property
-    def speed(self) -> float:
-        """Where searches begin: the bandwidth (rad/s) at which noise weighs as much as d."""
-        fastest = 0.5 / self.period
-        return fastest if self.noise <= 0.0 else min(self.balance(0), fastest)
-
     def balance(self, derivatives: int) -> float:
-        """
-        Return the bandwidth (rad/s) at which noise weighs as much as d, for N levels.
-
-        Noise of density noise^2 period leaves noise sqrt(period w^(2 N - 1)) in the N-th level.
-        Without any there is rounding.
-        """
+        """Return the bandwidth (rad/s) at which noise, or else rounding, weighs as much as d."""
         levels = self.model.order + 1 + derivatives
+        # Noise of density noise^2 period leaves noise sqrt(period w^(2 N - 1)) in level N.
         ratio = self.size / (max(self.noise, ROUNDING) * self.period**0.5)
         return float(min(ratio ** (1.0 / (levels - 0.5)), DEADBEAT / self.period))
-
-
-class Search(NamedTuple):
-    """What a method is tuned with."""
-
-    judged: Callable[[Values], float]  # from values to the objective over all recordings
-    setting: Setting
-    recordings: Sequence[Recording]
-    trials: int  # how often an objective may be evaluated
-    seed: int
 
 
 class Method(NamedTuple):
@@ -113,7 +92,8 @@ class Method(NamedTuple):
     """Raises ConfigurationError for values that make no observer."""
     space: Callable[[Setting], Sequence[Dimension]] = lambda _: ()
     """Parameters to tune for a setting."""
-    tune: Callable[[Search], Values] | None = None  # a search of its own
+    tune: Callable[..., Values] | None = None
+    """A search of its own: from objective, setting, recordings, trials and seed."""
 
 
 class Outcome(NamedTuple):
@@ -168,7 +148,7 @@ def tune(
 
     space, values = method.space(setting), {}
     if method.tune is not None:
-        values = dict(method.tune(Search(judged, setting, recordings, trials, seed)))
+        values = dict(method.tune(judged, setting, recordings, trials, seed))
     elif len(space) == 1:
         values = _scan(judged, space[0], trials)
     elif space:
@@ -197,91 +177,72 @@ LINEAR_LIMIT = 'Kalman, Matern'  # our observer equals this filter for small inn
 REACH = 10.0  # how far a search for the bandwidth goes, as a factor to both sides
 LONGEST, LONGEST_STEP = 1.5, 1.0
 """Steps of a prediction: nominal periods; seconds, for a model without dynamics of its own."""
-TRIED = (0, 1, 2, 3)  # derivatives of d
 GRID = len(DERIVATIVES) * len(RATES)  # trials that `tune` uses before its search
 
 
-class SampledModel:
-    """
-    The model, linearised at rest and extended by a chain of integrators that makes d.
-
-    States are scaled by powers of the period (s), because the Riccati equation is badly
-    conditioned otherwise. With a `chain` of 1 white noise drives d itself, with 2 its derivative.
-    All states of the chain decay at the rate `decay` (1/s), so that d is a Matern process.
-    """
-
-    def __init__(
-        self, model: TriangularModel, period: float, chain: int = 1, decay: float = 0.0
-    ) -> None:
-        n, self.size, self.period = model.order, model.order + chain, period
-        self.scale = period ** np.arange(self.size)  # scaled states are x_i * period^(i - 1)
-        self._rates = np.eye(self.size, k=1)
-        self._rates[range(n, self.size), range(n, self.size)] = -decay
-        jacobian = model.jacobian(np.zeros(n))
-        fastest = np.max(np.abs(np.linalg.eigvals(jacobian + np.eye(n, k=1))))
-        resolution = min(0.03 / max(float(fastest), 1e-9), LONGEST_STEP)
-        # Runge-Kutta steps (s) up to this one have a negligible error. For a linear model steps of
-        # 0.1 / fastest rate would do; a nonlinearity that is crossed within a few steps, such as
-        # dry friction, needs shorter ones.
-        self.longest = min(LONGEST * period, resolution)
-        self._rates[:n, :n] += jacobian
-
-    def kalman(self, intensity: float) -> Floats:
-        """
-        Return the steady-state Kalman gain for noise of variance 1 on y.
-
-        It is for a filter that predicts to t_k and then corrects with y_k itself; white noise of
-        the intensity drives the last state of the chain.
-        """
-        rates = self._rates * self.scale[:, None] / self.scale[None, :]
-        a, noise = harness.discretised(rates, self.size - 1, self.period)
-        noise = 0.5 * intensity * self.scale[-1] ** 2 * (noise + noise.T)
-        try:
-            with np.errstate(invalid='ignore'):  # the result is checked below
-                p = solve_discrete_are(a.T, np.eye(self.size)[:1].T, noise, np.eye(1))
-        except (np.linalg.LinAlgError, ValueError) as error:
-            raise ConfigurationError(f'Kalman gain: no solution ({error})') from None
-        gain = p[:, 0] / (p[0, 0] + 1.0) / self.scale
-        if not np.isfinite(gain).all():
-            raise ConfigurationError(f'Kalman gain: expected finite numbers, got {gain}')
-        return gain
-
-
-def samples_of(r: Recording, model: TriangularModel) -> Samples:
-    """Return the samples of a recording, as if each came one period after the one before."""
-    count = len(r.y)
-    periods, used = np.ones(count, np.int64), np.ones(count, np.bool_)
-    periods[0] = 0  # there a filter begins
-    u = known_inputs(r.u, model.inputs, count)
-    return Samples(np.diff(r.t, prepend=r.t[0]), periods, np.ascontiguousarray(r.y), u, used)
-
-
-def estimates(
-    model: TriangularModel, gain: Floats, decay: float, r: Recording, longest: float
+def steady_gain(
+    model: TriangularModel, period: float, bandwidth: float, decay: float, derivatives: int
 ) -> Floats:
     """
-    Return the estimates of z, d, d_1, .. of a recording, a row for each sample, by the gain K.
+    Return the gain K, (N,), of the filter that predicts to t_k and then corrects with y_k itself.
 
-    `decay` is 0 for a random walk; intervals beyond `longest` (s) take several steps. This is a
-    Kalman filter whose covariance P is as it has to be for K from the beginning, and stays.
+    The model is linearised at rest; behind it d and its derivatives decay at the rate `decay`
+    (1/s), 0 for a random walk, and white noise drives the last of them, as intense as makes
+    `bandwidth` (rad/s) about that of the filter. States are scaled by powers of the period (s),
+    because the Riccati equation is badly conditioned otherwise.
     """
-    expressions, size = model.with_unknown_input(decay, len(gain) - model.order - 1), len(gain)
+    n, size = model.order, model.order + 1 + derivatives
+    rates = np.eye(size, k=1)
+    rates[range(n, size), range(n, size)] = -decay
+    rates[:n, :n] += model.jacobian(np.zeros(n))
+    scale = period ** np.arange(size)  # scaled states are x_i * period^(i - 1)
+    a, noise = harness.discretised(rates * scale[:, None] / scale[None, :], size - 1, period)
+    intensity = period * bandwidth ** (2 * size)  # for noise of variance 1 on y
+    noise = 0.5 * intensity * scale[-1] ** 2 * (noise + noise.T)
+    try:
+        with np.errstate(invalid='ignore'):  # the result is checked below
+            p = solve_discrete_are(a.T, np.eye(size)[:1].T, noise, np.eye(1))
+    except (np.linalg.LinAlgError, ValueError) as error:
+        raise ConfigurationError(f'Kalman gain: no solution ({error})') from None
+    gain = p[:, 0] / (p[0, 0] + 1.0) / scale
+    if not np.isfinite(gain).all():
+        raise ConfigurationError(f'Kalman gain: expected finite numbers, got {gain}')
+    return gain
+
+
+def _steady(setting: Setting, values: Values) -> Run:
+    """
+    Return a run of the filter whose speed is about `bandwidth`.
+
+    It takes samples as if each came one period after the one before; its covariance P is as it has
+    to be for the gain from the beginning, and stays.
+    """
+    model, period, decay = setting.model, setting.period, values.get('decay', 0.0)
+    n, derivatives = model.order, int(values.get('derivatives', 0))
+    gain = steady_gain(model, period, values['bandwidth'], decay, derivatives)
+    size, expressions = len(gain), model.with_unknown_input(decay, derivatives)
     fresh = np.zeros((size, size))
     fresh[:, 0] = gain  # K = P_1 / (P_11 + variance)
     steady = SimpleNamespace(
         a=np.eye(size), q=np.zeros((size, size)), fresh=fresh, variance=1.0 - gain[0],
         clip=math.inf, settled=0,
     )  # fmt: skip
-    _, _, found = innovations(Prediction(expressions, longest), samples_of(r, model), steady)
-    return np.asarray(found)
+    # Runge-Kutta steps (s) up to this one have a negligible error. For a linear model steps of
+    # 0.1 / fastest rate would do; a nonlinearity that is crossed within a few steps, such as dry
+    # friction, needs shorter ones.
+    rates = model.jacobian(np.zeros(n)) + np.eye(n, k=1)
+    fastest = float(np.max(np.abs(np.linalg.eigvals(rates))))
+    longest = min(LONGEST * period, 0.03 / max(fastest, 1e-9), LONGEST_STEP)
 
+    def run(r: Recording) -> Floats:
+        count = len(r.y)
+        periods, used = np.ones(count, np.int64), np.ones(count, np.bool_)
+        periods[0] = 0  # there the filter begins
+        u, h = known_inputs(r.u, model.inputs, count), np.diff(r.t, prepend=r.t[0])
+        samples = Samples(h, periods, np.ascontiguousarray(r.y), u, used)
+        return innovations(Prediction(expressions, longest), samples, steady)[2][:, : n + 1]
 
-def _steady(setting: Setting, values: Values) -> Run:
-    """Return a run of the filter whose speed is about `bandwidth`."""
-    model, decay = setting.model, values.get('decay', 0.0)
-    sampled = SampledModel(model, setting.period, 1 + int(values.get('derivatives', 0)), decay)
-    gain = sampled.kalman(setting.period * values['bandwidth'] ** (2 * sampled.size))
-    return lambda r: estimates(model, gain, decay, r, sampled.longest)[:, : model.order + 1]
+    return run
 
 
 def matern_space(setting: Setting, derivatives: int = 0) -> tuple[Dimension, ...]:
@@ -293,16 +254,18 @@ def matern_space(setting: Setting, derivatives: int = 0) -> tuple[Dimension, ...
     )
 
 
-def each_order(search: Search) -> Values:
+def each_order(
+    judged: Callable[[Values], float], setting: Setting, _: object, trials: int, seed: int
+) -> Values:
     """Search bandwidth and decay with each number of derivatives of d."""
     best: tuple[float, Values] = (math.inf, {})
-    for k in TRIED:
+    for k in DERIVATIVES:
         fixed = {'derivatives': float(k)}
         found = minimise(
-            lambda v, fixed=fixed: search.judged(fixed | v),
-            matern_space(search.setting, k),
-            max(1, search.trials // len(TRIED)),
-            search.seed,
+            lambda v, fixed=fixed: judged(fixed | v),
+            matern_space(setting, k),
+            max(1, trials // len(DERIVATIVES)),
+            seed,
         )
         if not best[1] or found.best_value < best[0]:
             best = found.best_value, fixed | found.best_params
@@ -314,7 +277,7 @@ def _online(own: Values, setting: Setting, values: Values) -> Run:
     parameters = setting.told | dict(values) | dict(own)
 
     def estimate(r: Recording) -> Floats:
-        found = harness.observed(parameters, r.t, r.y, r.u)
+        found = harness.observed(parameters, r)
         return np.column_stack([found.z, found.unknown_input])
 
     return estimate
@@ -328,17 +291,19 @@ def _papers(variant: str) -> dict[str, Any]:
     return kept | {name: kept[name][:1] for name in ('lambda', 'alpha')} | {'variant': variant}
 
 
-def _tune(search: Search) -> Values:
+def _tune(
+    _: object, setting: Setting, recordings: Sequence[Recording], trials: int, seed: int
+) -> Values:
     """Return the parameters of the estimator that `tune` writes; its grid uses trials, too."""
-    tuning = TUNE_PARAMETERS.complete(search.setting.told | {'settled': JUDGED_FROM})
+    tuning = TUNE_PARAMETERS.complete(setting.told | {'settled': JUDGED_FROM})
     with redirect_stderr(StringIO()):  # its progress bars
-        tuner = Tuner(list(search.recordings), {}, tuning, search.seed)
-        return tuner.parameters(tuner.search(max(1, search.trials - GRID)).best_params)
+        tuner = Tuner(list(recordings), {}, tuning, seed)
+        return tuner.parameters(tuner.search(max(1, trials - GRID)).best_params)
 
 
 def _one_bandwidth(s: Setting) -> Sequence[Dimension]:
     """Return a range in rad/s, from far below any d to where the observer is deadbeat."""
-    return [Dimension('bandwidth', 0.05, 5.0 / s.period, s.speed)]
+    return [Dimension('bandwidth', 0.05, 5.0 / s.period, min(s.balance(0), 0.5 / s.period))]
 
 
 PAPERS = {'sign': 'sign', 'fuzzy': 'fuzzy', 'adaptive': 'fuzzy_adaptive'}

@@ -35,12 +35,9 @@ truth: with this one the estimate of d is closest to it. What others got stays i
 was at commit 1657d61. The last one holds sign(eps_i) over a step, as simulators with zero-crossing
 detection do; it is closer, but no method for the equations of the paper.
 """
-DURATION, CONVERGED = 20.0, 10.0
-"""Seconds of a simulation, and from where on errors and chatter are measured."""
-GRID = 1e-3
-"""Seconds between two recorded samples; an observer with a longer step records each of its own."""
-HIGH_PASS = 0.05
-"""Window of a moving average in seconds; the high-passed part is the signal minus that average."""
+DURATION, CONVERGED = 20.0, 10.0  # s, of a simulation, and after which scores count
+GRID = 1e-3  # s between recorded samples; an observer with a longer step records each of its own
+HIGH_PASS = 0.05  # s, window of the moving average that is taken off a signal
 Score = dict[str, float]  # scores of a run by name; see `score`
 Scores = dict[tuple[str, float], Score]  # by observer and angular frequency
 SAFE = {
@@ -68,10 +65,8 @@ OBSERVERS = {
 }
 """The four observers of the paper's section 3 and 4, and one of ours."""
 FINE, COARSE, FUZZY, ADAPTIVE = list(OBSERVERS)[:4]
-VISIBLE = 0.005
-"""High-passed RMS of the estimate of d from which chatter is visible: 5 % of d's amplitude."""
-SMOOTH = 0.1
-"""Fuzzy counts as free of chatter with at most this part of sign's high-passed RMS at 1e-5 s."""
+VISIBLE = 0.005  # high-passed RMS from which chatter is visible: 5 % of d's amplitude
+SMOOTH = 0.1  # fuzzy is free of chatter with at most this part of sign's high-passed RMS at 1e-5 s
 BADLY = 2.0  # sign at 1e-3 s is bad if its RMS error is at least this many times that at 1e-5 s
 MOVED = 0.01  # gamma counts as moving if it ends at least this far from where it began
 VARIANTS = ('sign', 'fuzzy', 'fuzzy_adaptive', 'sign_adaptive')

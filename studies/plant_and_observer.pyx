@@ -18,12 +18,11 @@ from fhaosmo_ros.core.simulation.system cimport System
 from typing import NamedTuple
 
 from fhaosmo_ros.core.model.inputs import Floats
-from fhaosmo_ros.core.model.triangular import TriangularModel
-from fhaosmo_ros.core.observer.configuration import ObserverConfiguration, per_level
+from fhaosmo_ros.core.observer.configuration import ObserverConfiguration
 from fhaosmo_ros.core.observer.observer import make_structure
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
-from fhaosmo_ros.core.parameters.tables import OBSERVER_PARAMETERS, PLANT_PARAMETERS
-from fhaosmo_ros.core.simulation.system import Disturbance
+from fhaosmo_ros.core.parameters.tables import OBSERVER_PARAMETERS
+from fhaosmo_ros.core.simulation.plant import Plant
 import numpy as np
 
 
@@ -74,14 +73,14 @@ cdef class Joint(Dynamics):
             self.state.level[0].z_hat = self.state.z[0]
         self.state.gamma = observer.memory.gamma
 
-    cdef void rates(self, int stage, double t, const double* x, double* slope) noexcept nogil:
+    cdef void rates(self, double t, const double* x, double* slope) noexcept nogil:
         """Write the rates of plant, levels and gamma."""
         cdef const State* now = <const State*>x
         cdef State* rate = <State*>slope
         cdef Level* after
         cdef int i
         memset(rate, 0, self.size * sizeof(double))
-        self.plant.rates(stage, t, now.z, rate.z)
+        self.plant.rates(t, now.z, rate.z)
         # A forward Euler step of length 1 moves the levels by their rates.
         memcpy(self.observer.level, now.level, self.observer.levels * sizeof(Level))
         self.observer.memory.gamma, self.observer.memory.y = now.gamma, now.z[0]
@@ -138,11 +137,8 @@ def simulate(observer, plant, step=1e-3, duration=20.0, every=1):
     """
     own = {'scheme': 'explicit', 'noise_size': 0.0}  # a solver has no scheme of its own
     configuration = ObserverConfiguration(OBSERVER_PARAMETERS.complete(observer).changed(own))
-    p = PLANT_PARAMETERS.complete(plant)
-    model, d = TriangularModel.of(p), Disturbance(p)
-    z = per_level(PLANT_PARAMETERS['initial_state'], p['initial_state'], model.order)
-    system = System(model.expressions, d, step, z)
+    cdef System system = Plant(plant)._system
     rows = round(duration / step) // every + 1
     z, z_hat, gamma = Joint(system, configuration).run(step, rows, every)
     t = np.arange(rows, dtype=np.float64) * (every * step)
-    return JointRun(t, z, d.along(t), z_hat, gamma)
+    return JointRun(t, z, system.d.along(t), z_hat, gamma)

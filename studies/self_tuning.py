@@ -45,16 +45,9 @@ class Estimates(NamedTuple):
 
 def estimate(model: Floats, y: Floats, period: float) -> Estimates:
     """
-    Estimate d from y.
+    Estimate d from y, (K,), which is z_1 and noise, sampled each `period` (s).
 
-    Parameters
-    ----------
-    model : (n, n) array
-        z' = model z + (0, .., 0, d); y is z_1 and noise.
-    y : (K,) array
-    period : float
-        Seconds between samples.
-
+    z' = model z + (0, .., 0, d), and model is (n, n).
     """
     first_noise = noise_of(y[:FIRST], len(model) + 1)
     members = [(omega / period, k) for omega in BANDWIDTHS for k in DERIVATIVES]

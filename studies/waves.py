@@ -3,29 +3,21 @@
 
 import math
 
+from fhaosmo_ros.core.simulation.metrics import rms
+from fhaosmo_ros.core.simulation.recordings import Floats
 import numpy as np
-from numpy.typing import NDArray
 from scipy.signal import lfilter, sawtooth
 
-Floats = NDArray[np.float64]
 BREAK_AWAY, KINETIC = 0.8, 0.4  # friction of `stick-slip`, relative to the force that drives it
 BLOW = 0.2  # length of an impulse, in 1 / omega
 
 
 def wave(kind: str, t: Floats, omega: float, random: np.random.Generator) -> Floats:
     """
-    Return a signal of unit RMS that moves at about `omega` rad/s.
+    Return a signal of unit RMS that moves at about `omega` rad/s, at evenly spaced times (s).
 
-    Parameters
-    ----------
-    kind : {'sine', 'chirp', 'ou', 'pulses', 'square', 'sawtooth', 'impulses', 'stick-slip'}
-        'ou' is first-order noise (Ornstein-Uhlenbeck), 'pulses' are Gaussian bells, 'impulses'
-        short blows, and 'stick-slip' is a friction that holds a sine until it breaks away.
-    t : (K,) array
-        Evenly spaced times (s).
-    omega : float
-    random : Generator
-
+    'ou' is first-order noise (Ornstein-Uhlenbeck), 'pulses' are Gaussian bells, 'impulses' short
+    blows, and 'stick-slip' is a friction that holds a sine until it breaks away.
     """
     phase = random.uniform(0.0, 2.0 * np.pi)
     angle = omega * t + phase
@@ -51,4 +43,4 @@ def wave(kind: str, t: Floats, omega: float, random: np.random.Generator) -> Flo
         d = np.zeros(len(t))
         for middle in np.arange(random.uniform(0.0, 3.0), t[-1], 2.6 * np.pi / omega):
             d += random.standard_normal() * np.exp(-0.5 * (1.5 * omega * (t - middle)) ** 2)
-    return np.asarray(d / np.sqrt(np.mean(d**2)))
+    return np.asarray(d / rms(d))

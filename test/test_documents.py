@@ -12,7 +12,7 @@ from fhaosmo_ros.commands import COMMANDS
 from fhaosmo_ros.core import Counters, Observer, OnlineEstimator, Plant
 from fhaosmo_ros.core.parameters import tables
 from fhaosmo_ros.core.parameters.files import load
-from fhaosmo_ros.tools.tuning.objective import TUNE_PARAMETERS
+from fhaosmo_ros.tools.tuning.tuner import TUNE_PARAMETERS
 import numpy as np
 import pytest
 import results

@@ -5,7 +5,7 @@ import ast
 import math
 
 from fhaosmo_ros.core import ConfigurationError, Observer, OnlineEstimator, TriangularModel
-from fhaosmo_ros.core.model.expressions import MAX_LENGTH, MAX_OPERATIONS, parse
+from fhaosmo_ros.core.model.triangular import MAX_LENGTH, MAX_OPERATIONS, parse
 from fhaosmo_ros.core.parameters.tables import OBSERVER_PARAMETERS
 from hypothesis import given
 from hypothesis import strategies as st

@@ -2,15 +2,14 @@
 """What `tune` finds in a y without the truth (D 30), and when it refuses."""
 
 import bag_files as files
-from fhaosmo_ros.core import ConfigurationError, Family, Observer, OnlineEstimator, TriangularModel
+from fhaosmo_ros.core import ConfigurationError, Family, Observer, OnlineEstimator
 from fhaosmo_ros.core.parameters.files import load
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
 from fhaosmo_ros.core.simulation.metrics import rms
 from fhaosmo_ros.tools.tuning import identify
-from fhaosmo_ros.tools.tuning.command import main
+from fhaosmo_ros.tools.tuning.command import main, notes
 from fhaosmo_ros.tools.tuning.identify import Design
-from fhaosmo_ros.tools.tuning.objective import stamps_of
-from fhaosmo_ros.tools.tuning.report import notes
+from fhaosmo_ros.tools.tuning.tuner import stamps_of
 import numpy as np
 from observer_cases import matern, states_of
 import pytest
@@ -36,8 +35,7 @@ def noise():
 def found_in(y, phi=PHI, **given):
     given = {'order': len(phi), 'phi': list(phi)} | given
     values = ESTIMATOR_PARAMETERS.complete(given)
-    model = TriangularModel.of(values)
-    found = identify.Identification((T, y, np.zeros((K, 1))), model, values, given)
+    found = identify.Identification((T, y, np.zeros((K, 1))), values, given)
     return found, *found.gains()
 
 
@@ -49,10 +47,10 @@ def _plain():
 def test_truth_is_likelier_than_other_designs(plain):
     found, *_ = plain
     bandwidth = ((SIZE**2 * (2.0 * RATE) ** 3 / 2.0) / (NOISE**2 * H)) ** (1 / 8)
-    truth = Design(1, bandwidth, RATE / bandwidth)
+    truth = Design(1, bandwidth, RATE)
     assert found.size_of_input(truth, NOISE) == pytest.approx(SIZE)
     best = found.evaluate(truth).log_likelihood
-    for change in ({'bandwidth': 1.5 * bandwidth}, {'ratio': 10.0 * truth.ratio}):
+    for change in ({'bandwidth': 1.5 * bandwidth}, {'decay': 10.0 * RATE}):
         assert found.evaluate(truth._replace(**change)).log_likelihood < best - 3.0
     assert found.best.log_likelihood > best - 1.0
 

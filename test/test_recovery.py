@@ -12,7 +12,7 @@ from fhaosmo_ros.core.parameters.files import load
 from fhaosmo_ros.core.parameters.tables import ONLINE_PARAMETERS, PLANT_PARAMETERS
 from fhaosmo_ros.core.simulation.metrics import rms
 from fhaosmo_ros.core.simulation.plant import Plant
-from fhaosmo_ros.tools.tuning.objective import stamps_of
+from fhaosmo_ros.tools.tuning.tuner import stamps_of
 import numpy as np
 from observer_cases import remembered
 import pytest

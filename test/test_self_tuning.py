@@ -7,7 +7,7 @@ from fhaosmo_ros.core import Observer, OnlineEstimator, Plant, Status
 from fhaosmo_ros.core.model.triangular import TriangularModel
 from fhaosmo_ros.core.observer.self_tuning.intervals import within
 from fhaosmo_ros.core.simulation.metrics import rms
-from fhaosmo_ros.tools.tuning.objective import stamps_of
+from fhaosmo_ros.tools.tuning.tuner import stamps_of
 import numpy as np
 from observer_cases import discrete, matern, states_of
 import pytest
@@ -250,7 +250,7 @@ def test_how_sure_it_is_of_a_quantised_y(plant):
     inside = []
     for kind in ('sine', 'chirp', 'ou', 'square', 'pulses'):
         r, values = study(plant, CONDITIONS['y in steps of 5 sigma'], kind, seed=3)
-        found = observed(values, r.t, r.y)
+        found = observed(values, r)
         d, deviation = found.unknown_input, found.standard_deviation
         late = r.t > 3.0
         wrong = np.abs(d - r.d)[late]
@@ -326,7 +326,7 @@ def test_y_that_stands_still_says_no_more_with_every_sample():
 def test_noise_that_grows_is_not_taken_for_a_jump_of_d(name, kind, seed):
     """A hundredfold noise has samples farther and farther off by chance (D 33)."""
     r, values = study(name, Condition(later=100.0), kind, 8.0, seed)
-    found = observed(values, r.t, r.y).unknown_input
+    found = observed(values, r).unknown_input
     assert np.abs(found - r.d).max() < 4.0 * np.abs(r.d).max()
 
 

@@ -9,7 +9,7 @@ from fhaosmo_ros.core.observer.kalman import INPUT_DOUBT, STATES_DOUBT
 from fhaosmo_ros.core.observer.status import REJECTED, Status
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.simulation.metrics import rms
-from fhaosmo_ros.tools.tuning.objective import stamps_of
+from fhaosmo_ros.tools.tuning.tuner import stamps_of
 import numpy as np
 from observer_cases import discrete, matern, states_of
 import pytest

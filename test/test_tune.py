@@ -18,12 +18,11 @@ from fhaosmo_ros.core.simulation.metrics import rms
 from fhaosmo_ros.core.simulation.recordings import FAMILY_PARAMETERS
 from fhaosmo_ros.tools.tuning.command import main, read_parameters
 from fhaosmo_ros.tools.tuning.linear_gains import SCHEME
-from fhaosmo_ros.tools.tuning.objective import Objective, stamps_of, TUNE_PARAMETERS
 from fhaosmo_ros.tools.tuning.search import BAD, Dimension, minimise
-from fhaosmo_ros.tools.tuning.tuner import simulated, Tuner
+from fhaosmo_ros.tools.tuning.tuner import Objective, simulated, stamps_of, TUNE_PARAMETERS, Tuner
 import numpy as np
 import pytest
-from studies.methods import estimates, SampledModel
+from studies.methods import METHODS, Setting
 
 pytest.importorskip('optuna', reason='optuna is not installed (extra: tune)')
 pytest.importorskip('cmaes', reason='cmaes is not installed (extra: tune)')
@@ -78,13 +77,11 @@ def test_start_is_nearly_as_good_as_the_best_kalman_filter():
     """Of filters of d as a random walk, over two decades of bandwidths."""
     values = VALUES.changed({'duration': 6.0, 'settled': 2.0, 'recordings': 3})
     tuner = Tuner(simulated(values, 1)[0], {}, values, 1)
-    best, model = np.inf, TriangularModel(PHI, 3)
+    best, setting = np.inf, Setting(TriangularModel(PHI, 3), 1.0 / 200.0, 0.07, 1e-4)
     for bandwidth in np.geomspace(2.0, 200.0, 25):
-        gain = SampledModel(model, 1.0 / 200.0).kalman(bandwidth**8 / 200.0)
-        errors = [
-            rms((estimates(model, gain, 0.0, r, 0.1)[:, 3] - r.d)[r.t >= 2.0])
-            for r in tuner.objective.recordings
-        ]
+        run = METHODS['Kalman'].prepare(setting, {'bandwidth': bandwidth})
+        recordings = tuner.objective.recordings
+        errors = [rms((run(r)[:, 3] - r.d)[r.t >= 2.0]) for r in recordings]
         best = min(best, np.exp(np.mean(np.log(errors))) / tuner.objective.scale[-1])
     start = {d.name: d.start for d in tuner.space}
     assert tuner.objective(tuner.parameters(start))[0] < 1.03 * best

@@ -36,7 +36,7 @@ class PlantNode(BaseNode):
         self._u = [0.0] * len(self.plant.model.inputs)
         self._now: int | None = None  # of the node's clock, in ns, and the time of the plant
         self._time = 0
-        self._state_message = labelled([f'z{i + 1}' for i in range(self.plant.order)])
+        self._state_message = labelled([f'z{i + 1}' for i in range(self.plant.model.order)])
         check_overrides(self, TOPICS)
         self._publish_y, self._publish_state, self._publish_d = (
             create_publisher(self, kind, topic).publish for topic, kind in TOPICS.items()
@@ -48,7 +48,7 @@ class PlantNode(BaseNode):
         self.plant.sample(0.0)
         self._timer = self.create_timer(1.0 / values['sample_rate'], self._tick)
         self.get_logger().info(
-            f'simulating {self.plant.order} states, d: {values["disturbance"]}, '
+            f'simulating {self.plant.model.order} states, d: {values["disturbance"]}, '
             f'y at {values["sample_rate"]:g} Hz'
         )
 

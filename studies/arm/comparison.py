@@ -8,6 +8,7 @@ from typing import Any
 from fhaosmo_ros.core.arm.arm import Arm
 from fhaosmo_ros.core.arm.identification import identify
 from fhaosmo_ros.core.arm.model import ArmModel
+from fhaosmo_ros.core.simulation.metrics import rms
 from fhaosmo_ros.tools.tuning.search import minimise, Values
 import numpy as np
 from studies.arm.peers import momentum, PEERS
@@ -63,7 +64,7 @@ def judged(robot: str, by_position: bool, duration: float, quick: bool) -> list[
 
         best = minimise(error, space, 5 if quick else TRIALS[len(space)]).best_params
         late = free.t > SETTLED
-        size = np.sqrt(np.mean(peer(prepared[id(free)], best)[late] ** 2, axis=0))
+        size = rms(peer(prepared[id(free)], best)[late])
         found: dict[str, Group] = {}
         for situation, group in everything.items():
             pairs = [(w, peer(prepared[id(w)], best)) for w in group]

@@ -28,8 +28,7 @@ from studies.arm.world import rmse, simulate, Touched, urdf_of
 from studies.harness import Floats
 
 ROBOT, SEED, DURATION = 'iiwa', 10, 16.0
-BALLS, PUSH = (2.5, 13.0), 9.5
-"""Seconds at which a ball is thrown, and at which the slow push begins."""
+BALLS, PUSH = (2.5, 13.0), 9.5  # s, when a ball is thrown, and when the slow push begins
 GAIN = 50.0  # 1/s, of the classical observer: a usual one
 FIRST = 10**9  # ns, stamp of the first sample
 TORQUE, EVENT = '/arm/external_torque', '/arm/event'

@@ -17,10 +17,7 @@ import numpy as np
 from studies.evidence import markdown
 from studies.harness import Floats
 
-FREE = ('ur-19_12_23_free.csv', 'ur-20_01_31-unload.csv')
-"""Free motion without payload, of two days."""
-PLACES = slice(1, 7), slice(13, 19)
-"""Columns of positions (rad) and currents (A), behind that of time (s)."""
+FREE = ('ur-19_12_23_free.csv', 'ur-20_01_31-unload.csv')  # without payload, of two days
 
 
 def main() -> int:
@@ -47,9 +44,9 @@ def main() -> int:
 
 
 def _recording(path: Path) -> tuple[Floats, Floats, Floats]:
-    """Return times, positions and currents of a recording."""
+    """Return times (s), positions (rad) and currents (A) of a recording."""
     table = np.loadtxt(path, delimiter=',')
-    return table[:, 0], *(table[:, place] for place in PLACES)
+    return table[:, 0], table[:, 1:7], table[:, 13:19]
 
 
 if __name__ == '__main__':

@@ -14,9 +14,9 @@ from matplotlib.figure import Figure
 import numpy as np
 from studies import evidence
 from studies.evidence import Row
-from studies.harness import Found, Results, run_study, SELF_TUNING
+from studies.harness import Found, observed, Results, run_study, SELF_TUNING
 from studies.recipes import encoder, hidden_force, joint_torque, motor_load
-from studies.recipes.judging import Fold, Folds, judge, OURS, Recipe, run
+from studies.recipes.judging import Fold, Folds, judge, OURS, Recipe
 
 NAME = 'recipes'
 RECIPES: dict[str, Recipe] = {
@@ -93,7 +93,8 @@ def _estimates(axes: Axes, recipe: Recipe, fold: Fold, rows: Mapping[str, Row]) 
         found = scale * method.estimate(fold.parameters, r, number)[part]
         axes.plot(r.t[part], found, color=colour, lw=1.1, label=name)
         if name == OURS and recipe.band:
-            deviation = run(fold.parameters | SELF_TUNING, r).standard_deviation[part, -1]
+            tuned = observed(fold.parameters | SELF_TUNING, r)
+            deviation = tuned.standard_deviation[part, -1]
             draw_band(axes, r.t[part], found, abs(scale) * deviation, colour)
     low, high = np.percentile(scale * r.d[part], (0, 100))
     room = 0.6 * (high - low)

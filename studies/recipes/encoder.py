@@ -8,11 +8,11 @@ from typing import Any
 from fhaosmo_ros.core import Family
 import numpy as np
 from scipy.signal import lfilter, savgol_coeffs
-from studies.harness import Floats, SELF_TUNING
+from studies.harness import Floats
 from studies.recipes import judging
-from studies.recipes.judging import FIXED, Fold, Method, OURS, Recipe, Recorded
+from studies.recipes.judging import FIXED, Fold, Method, OURS, Recipe, Recorded, VELOCITY
 
-ACCELERATION, VELOCITY = 'acceleration', 'velocity'
+ACCELERATION = 'acceleration'
 KINDS = ('smooth', 'steps')  # of acceleration, as `disturbances` below has them in turn
 JOINT = {
     'order': 2, 'phi': ['0', '0'], 'duration': 8.0, 'sample_rate': 1000.0, 'initial_state': 0.0,
@@ -35,13 +35,6 @@ def savitzky_golay(degree: int, _: Mapping[str, Any], r: Recorded, window: float
     count, derivative = round(window), 1 if r.quantity == VELOCITY else 2
     weights = savgol_coeffs(count, degree, derivative, r.period, pos=count - 1)
     return np.asarray(lfilter(weights, [1.0], r.y))
-
-
-def this_observer(p: Mapping[str, Any], r: Recorded, bandwidth: float) -> Floats:
-    """Return z2 or d of the observer with gains of a bandwidth; 0: self-tuning."""
-    gains = judging.fixed_gains(2, bandwidth, r.period) if bandwidth else SELF_TUNING
-    found = judging.run(dict(p) | gains, r)
-    return found.z[:, 1] if r.quantity == VELOCITY else found.unknown_input
 
 
 def conditions(_: None) -> dict[str, list[Fold]]:
@@ -67,8 +60,8 @@ RECIPE = Recipe(
         'difference, low-passed': Method(difference, BANDWIDTHS),
         'Savitzky-Golay, causal, degree 2': Method(partial(savitzky_golay, 2), WINDOWS, 'samples'),
         'Savitzky-Golay, causal, degree 3': Method(partial(savitzky_golay, 3), WINDOWS, 'samples'),
-        OURS: Method(this_observer),
-        FIXED: Method(this_observer, BANDWIDTHS),
+        OURS: Method(judging.this_observer),
+        FIXED: Method(judging.this_observer, BANDWIDTHS),
     },
     conditions, 'acceleration [rad/s²]', ('Savitzky-Golay, causal, degree 3', OURS), (2.0, 4.0),
     band=False,

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from studies.harness import Floats, SELF_TUNING
+from studies.harness import Floats, observed, SELF_TUNING
 from studies.recipes import judging
 from studies.recipes.judging import FIXED, Fold, Method, OURS, Recipe, Recorded
 
@@ -57,12 +57,12 @@ def fixed(p: Mapping[str, Any], r: Recorded, bandwidth: float) -> Floats:
         'unknown_input_derivatives': 1,
         'lambda': [comb(4, k) * bandwidth**k for k in range(1, 5)],
     }
-    return judging.run(dict(p) | gains, r).unknown_input
+    return observed(dict(p) | gains, r).unknown_input
 
 
 def lagging(p: Mapping[str, Any], r: Recorded, _: float) -> Floats:
     """Return what the observer that is told only the model says of d one sample later."""
-    found = judging.run(dict(p) | SELF_TUNING | {'smoothing_lag': SMOOTHING}, r)
+    found = observed(dict(p) | SELF_TUNING | {'smoothing_lag': SMOOTHING}, r)
     told = 1e-9 * (found.t - 10**9) + LAG * PERIOD
     return np.interp(r.t - r.t[0], told, found.unknown_input)
 
@@ -98,7 +98,7 @@ RECIPE = Recipe(
         'disturbance observer': Method(judging.disturbance_observer, BANDWIDTHS),
         'Kalman filter, d a random walk': Method(judging.kalman_filter, BANDWIDTHS),
         FIXED: Method(fixed, BANDWIDTHS),
-        OURS: Method(judging.self_tuning),
+        OURS: Method(judging.this_observer),
         LAGGING: Method(lagging),
     },
     conditions, 'V1 [V]', ('disturbance observer', LAGGING), (5.0, 5.12),

@@ -69,14 +69,10 @@ def identify(r: Recorded) -> tuple[dict[str, float], float]:
     return {'p': p, 'h': h, 'r': h * ratio, 'g1': g1, 'k': k, 'v': v, 'c': c}, offset
 
 
-def inertia(p: Mapping[str, Any], r: Recorded) -> Floats:
-    """Return J(q2), by which the shoulder's acceleration is torque / J."""
-    return np.asarray(p['constants.p'] - p['constants.r'] * np.cos(r.u[:, 1]) ** 2)
-
-
 def torque(method: judging.Estimate, p: Mapping[str, Any], r: Recorded, number: float) -> Floats:
-    """Return the torque by what a method says of d: d J(q2)."""
-    return method(p, r, number) * inertia(p, r)
+    """Return the torque by what a method says of d, which is torque / J(q2)."""
+    inertia = p['constants.p'] - p['constants.r'] * np.cos(r.u[:, 1]) ** 2
+    return method(p, r, number) * inertia
 
 
 def momentum_observer(p: Mapping[str, Any], r: Recorded, bandwidth: float) -> Floats:
@@ -120,8 +116,8 @@ RECIPE = Recipe(
     {
         'momentum observer': Method(momentum_observer, BANDWIDTHS),
         'Kalman filter, d a random walk': Method(partial(torque, kalman_filter), BANDWIDTHS),
-        FIXED: Method(partial(torque, judging.fixed), BANDWIDTHS),
-        OURS: Method(partial(torque, judging.self_tuning)),
+        FIXED: Method(partial(torque, judging.this_observer), BANDWIDTHS),
+        OURS: Method(partial(torque, judging.this_observer)),
     },
     conditions, 'torque at the shoulder [N m]', ('momentum observer', FIXED, OURS),
     (0.5, 4.7), band=False, data='bag of the pendubot',

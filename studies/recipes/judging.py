@@ -9,9 +9,10 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from fhaosmo_ros.core import Trajectory, TriangularModel
+from fhaosmo_ros.core import TriangularModel
 from fhaosmo_ros.core.parameters.files import load
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
+from fhaosmo_ros.tools.tuning.linear_gains import SCHEME
 import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import bilinear, lfilter
@@ -19,9 +20,9 @@ from studies.evidence import Row
 from studies.harness import Floats, model_alone, observed, SELF_TUNING
 
 CONFIG = Path(__file__).resolve().parents[2] / 'config' / 'recipes'
+VELOCITY = 'velocity'  # a `quantity`
 OURS, FIXED = 'this observer, self-tuning', 'this observer, fixed gains'
-BUTTERWORTH = {2: (np.sqrt(2.0), 1.0), 3: (2.0, 2.0, 1.0)}
-"""Coefficients of Butterworth polynomials of degree N, without the first one."""
+BUTTERWORTH = {2: (np.sqrt(2.0), 1.0), 3: (2.0, 2.0, 1.0)}  # polynomials, but their first 1
 FAR = 1.0  # half-width of psi; smaller innovations are corrected linearly
 
 
@@ -90,36 +91,23 @@ def model(name: str, constants: Mapping[str, float] | None = None) -> dict[str, 
     return model_alone(p) | {f'constants.{k}': float(v) for k, v in (constants or {}).items()}
 
 
-def plant_of(parameters: Mapping[str, Any]) -> TriangularModel:
-    """Return the model that the estimator's parameters describe."""
-    return TriangularModel.of(ESTIMATOR_PARAMETERS.complete(parameters))
-
-
-def run(parameters: Mapping[str, Any], r: Recorded) -> Trajectory:
-    """Return what the node would have estimated."""
-    return observed(parameters, r.t, r.y, r.u)
-
-
-def self_tuning(parameters: Mapping[str, Any], r: Recorded, _: float = 0.0) -> Floats:
-    """Return d of the observer that is told only the model."""
-    return run(dict(parameters) | SELF_TUNING, r).unknown_input
-
-
 def fixed_gains(order: int, bandwidth: float, period: float) -> dict[str, Any]:
     """Return the gains of a linear observer with Butterworth poles at a bandwidth (rad/s)."""
     shape = BUTTERWORTH[order + 1]
     return {
-        'structure': 'levant', 'scheme': 'predict_correct',
-        'variant': 'fuzzy_adaptive', 'correction_period': period, 'fuzzy_widths': [FAR],
+        **SCHEME, 'correction_period': period, 'fuzzy_widths': [FAR],
         'lambda': [float(c * bandwidth ** (k + 1) * FAR) for k, c in enumerate(shape)],
-        'gamma_initial': 0.001, 'gamma_min': 0.0001, 'gamma_rate': 0.0, 'divergence_time': 0.5,
+        'gamma_initial': 0.001, 'divergence_time': 0.5,
     }  # fmt: skip
 
 
-def fixed(parameters: Mapping[str, Any], r: Recorded, bandwidth: float) -> Floats:
-    """Return d of the observer with fixed gains of a bandwidth (rad/s)."""
-    gains = fixed_gains(parameters['order'], bandwidth, r.period)
-    return run(dict(parameters) | gains, r).unknown_input
+def this_observer(parameters: Mapping[str, Any], r: Recorded, bandwidth: float) -> Floats:
+    """Return z2 or d of the observer with gains of a bandwidth (rad/s); 0: self-tuning."""
+    gains: dict[str, Any] = SELF_TUNING
+    if bandwidth:
+        gains = fixed_gains(parameters['order'], bandwidth, r.period)
+    found = observed(dict(parameters) | gains, r)
+    return found.z[:, 1] if r.quantity == VELOCITY else found.unknown_input
 
 
 def low_passed(x: Floats, bandwidth: float, period: float, order: int, derivative: int) -> Floats:
@@ -136,7 +124,7 @@ def disturbance_observer(p: Mapping[str, Any], r: Recorded, bandwidth: float) ->
     The low-passed second derivative less what the model explains (Chen et al. 2016,
     doi:10.1109/TIE.2015.2478397).
     """
-    model, h = plant_of(p), r.period
+    model, h = TriangularModel.of(ESTIMATOR_PARAMETERS.complete(p)), r.period
     velocity = low_passed(r.y, bandwidth, h, 2, 1)
     samples = zip(np.column_stack([r.y, velocity]), r.u, strict=True)
     explained = np.array([model.evaluate(z, u)[1] for z, u in samples])
@@ -151,7 +139,7 @@ def kalman_filter(p: Mapping[str, Any], r: Recorded, bandwidth: float) -> Floats
     Only the ratio of the two noises matters; it is given as the bandwidth of the steady filter of
     the chain of integrators: q = bandwidth^(2N) noise² h, N = n + 1.
     """
-    model = plant_of(p)
+    model = TriangularModel.of(ESTIMATOR_PARAMETERS.complete(p))
     n, h = model.order, r.period
     q = bandwidth ** (2 * n + 2) * h
     x = np.zeros(n + 1)
@@ -190,11 +178,7 @@ def error(pairs: Iterable[tuple[Recorded, Floats]]) -> float:
 
 
 def judge(method: Method, folds: Sequence[Fold]) -> Row:
-    """
-    Return the error of a method over all recordings, and what was chosen.
-
-    Its number is the one with the least error on the training recordings of a fold.
-    """
+    """Return a method's error over all recordings; its numbers are those best in training."""
     pairs, chosen = [], []
     for p, training, judged in folds:
         best = method.numbers[0]

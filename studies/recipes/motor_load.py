@@ -76,8 +76,8 @@ RECIPE = Recipe(
     {
         'disturbance observer': Method(judging.disturbance_observer, BANDWIDTHS),
         'Kalman filter, d a random walk': Method(judging.kalman_filter, BANDWIDTHS),
-        FIXED: Method(judging.fixed, BANDWIDTHS),
-        OURS: Method(judging.self_tuning),
+        FIXED: Method(judging.this_observer, BANDWIDTHS),
+        OURS: Method(judging.this_observer),
     },
     conditions, 'load torque [N m]', ('disturbance observer', OURS), (0.5, 6.0), scale=INERTIA,
     fold=3,

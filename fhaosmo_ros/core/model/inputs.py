@@ -15,20 +15,8 @@ def known_inputs(u: ArrayLike, names: Sequence[str], count: int | None = None) -
     """
     Return the known inputs of one interval, (m,), or of `count` intervals, (count, m).
 
-    Parameters
-    ----------
-    u : number or array
-        Of that shape, or (count,) of the only input. A number is the only input's, always, or 0.
-    names : sequence of str
-        Names of the m inputs.
-    count : int, optional
-        Number of intervals.
-
-    Raises
-    ------
-    ConfigurationError
-        Another shape.
-
+    `u` is of that shape, or (count,) of the only input; a number is the only input's, always, or 0
+    for any of them. Raises ConfigurationError for another shape.
     """
     values, single = np.asarray(u, dtype=np.float64), len(names) == 1
     shape = (len(names),) if count is None else (count, len(names))
@@ -47,13 +35,8 @@ def samples_of_run(t: ArrayLike, y: ArrayLike) -> tuple[NDArray[Any], Floats]:
     """
     Return times and samples as contiguous arrays (K,) of 64-bit numbers; integers stay integers.
 
-    Columns of a table, (K, 1), are taken as well.
-
-    Raises
-    ------
-    ConfigurationError
-        More dimensions, or different lengths.
-
+    Columns of a table, (K, 1), are taken as well. Raises ConfigurationError for more dimensions,
+    or different lengths.
     """
     columns: list[NDArray[Any]] = []
     for values in (np.asarray(t), np.asarray(y, dtype=np.float64)):

@@ -7,7 +7,7 @@ cpdef enum:
     NEG, SIN, COS, TAN, EXP, LOG, SQRT, ABS, TANH, SIGN
 
 cdef enum:
-    MOST_OPERANDS = 128  # on the stack of an expression; above `MAX_OPERATIONS` of expressions.py
+    MOST_OPERANDS = 128  # on the stack of an expression; above `MAX_OPERATIONS` of triangular.py
 
 
 cdef struct Dual:

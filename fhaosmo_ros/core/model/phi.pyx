@@ -36,21 +36,11 @@ cdef check(one, int states, int inputs):
 
 cdef class Expressions:
     """
-    Several expressions; immutable, so that threads can share it.
+    Several expressions of states and known inputs; immutable, so that threads can share it.
 
-    Parameters
-    ----------
-    source : sequence of sequences of (int, float)
-        Each expression's operations in postfix order: `CONST` .. `SIGN`, and the constant, or the
-        index of the state or input, that belongs to it. An empty expression is the constant 0.
-    states, inputs : int
-        How many states and known inputs there are.
-
-    Raises
-    ------
-    ValueError
-        Operations that lack operands, or that are more than an evaluation has room for.
-
+    `source` has each expression's operations in postfix order: `CONST` .. `SIGN`, and the
+    constant, or the index of the state or input, that belongs to it. An empty expression is the
+    constant 0. Raises ValueError for operations that lack operands, or need too much room.
     """
 
     def __cinit__(self, source, int states, int inputs):
@@ -149,23 +139,9 @@ cdef class Expressions:
 
     def along(self, z, dz, u):
         """
-        Return all expressions and their derivatives along dz.
+        Return values of all expressions, and their derivatives along dz: (2, count).
 
-        Parameters
-        ----------
-        z, dz : (n,) arrays
-        u : (m,) array
-
-        Returns
-        -------
-        (2, count) array
-            Values, and derivatives.
-
-        Raises
-        ------
-        ValueError
-            Arrays that are too short.
-
+        `z` and `dz` are (n,) arrays, `u` is (m,). Raises ValueError if one is too short.
         """
         cdef const double[::1] states = np.ascontiguousarray(z, dtype=np.float64)
         cdef const double[::1] tangent = np.ascontiguousarray(dz, dtype=np.float64)

@@ -22,7 +22,7 @@ cdef Method CLASSICAL  # order 4
 cdef class Dynamics:
     # A system x' = f(t, x).
     cdef int size  # number of states, at most MOST_STATES
-    cdef void rates(self, int stage, double t, const double* x, double* slope) noexcept nogil
+    cdef void rates(self, double t, const double* x, double* slope) noexcept nogil
 
 
 cdef void take_step(

@@ -16,8 +16,8 @@ cdef int MOST_STEPS = 4000  # of one prediction: bounds what a sample may cost
 cdef class Dynamics:
     """A system x' = f(t, x) of at most 96 states; others implement `rates`."""
 
-    cdef void rates(self, int stage, double t, const double* x, double* slope) noexcept nogil:
-        """Write f(t, x) to `slope`; `stage` is 0 at the beginning of a step."""
+    cdef void rates(self, double t, const double* x, double* slope) noexcept nogil:
+        """Write f(t, x) to `slope`."""
 
 
 cdef void take_step(
@@ -32,7 +32,7 @@ cdef void take_step(
     for i in range(size):
         point[i] = total[i] = x[i]
     for stage in range(method.stages):
-        system.rates(stage, t + method.node[stage] * h, point, slope)
+        system.rates(t + method.node[stage] * h, point, slope)
         share = h * method.weight[stage]
         for i in range(size):
             total[i] += share * slope[i]
@@ -50,14 +50,7 @@ cdef class Prediction(Dynamics):
 
     Whoever predicts writes the state to `z` and a direction to `dz`, calls `over`, and finds both
     at the end of the interval: the estimate there, and its exact derivative in that direction.
-
-    Parameters
-    ----------
-    phi : Expressions
-        Phi_1 .. Phi_n, and the model of the unknown input behind them.
-    longest : float
-        Longest Runge-Kutta step (s).
-
+    `phi` has the model of the unknown input behind Phi_1 .. Phi_n.
     """
 
     def __cinit__(self, Expressions phi not None, double longest):
@@ -67,7 +60,7 @@ cdef class Prediction(Dynamics):
         self.size = 2 * self.n
         self.z, self.dz = self.x, self.x + self.n
 
-    cdef void rates(self, int stage, double t, const double* x, double* slope) noexcept nogil:
+    cdef void rates(self, double t, const double* x, double* slope) noexcept nogil:
         """Write the rates of P triangular and their derivatives."""
         cdef int i, n = self.n
         cdef Dual phi

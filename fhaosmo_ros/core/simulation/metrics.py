@@ -28,12 +28,7 @@ def high_passed(x: Series, window: int) -> float:
     """
     Return the RMS of what a centred moving average leaves: chatter without the signal below it.
 
-    Parameters
-    ----------
-    x : (K,) array
-    window : int
-        Samples that are averaged, rounded up to an odd number, at most K.
-
+    It averages `window` samples of x, (K,), rounded up to an odd number; NaN if K is less.
     """
     window |= 1
     if len(x) < window:

@@ -11,27 +11,15 @@ from fhaosmo_ros.core.parameters.declaration import Parameters
 from fhaosmo_ros.core.parameters.tables import PLANT_PARAMETERS
 from fhaosmo_ros.core.simulation.system import Disturbance, System
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 
 class Truth(NamedTuple):
-    """
-    The plant at one time, or at many (arrays with a leading axis).
+    """The plant at one time, or at K times (arrays with a leading axis)."""
 
-    Attributes
-    ----------
-    y : float or (K,) array
-        Measured output, with noise and quantisation.
-    z : (n,) or (K, n) array
-        States.
-    unknown_input : float or (K,) array
-        d.
-
-    """
-
-    y: Any
-    z: NDArray[np.float64]
-    unknown_input: Any
+    y: Any  # float or (K,): measured output, with noise and quantisation
+    z: Floats  # (n,) or (K, n): states
+    unknown_input: Any  # float or (K,): d
 
 
 class Plant:
@@ -45,6 +33,13 @@ class Plant:
     **named
         Parameters as keyword arguments, which win.
 
+    Attributes
+    ----------
+    parameters : Parameters
+        All parameters with their present values.
+    model : TriangularModel
+        Phi, and the names of the known inputs.
+
     Raises
     ------
     ConfigurationError
@@ -53,71 +48,42 @@ class Plant:
     """
 
     def __init__(self, parameters: Mapping[str, Any] | None = None, /, **named: Any) -> None:
-        p = self._parameters = PLANT_PARAMETERS.complete(parameters, named)
-        self._model = TriangularModel.of(p)
-        z = per_level(PLANT_PARAMETERS['initial_state'], p['initial_state'], self._model.order)
+        p = self.parameters = PLANT_PARAMETERS.complete(parameters, named)
+        self.model = TriangularModel.of(p)
+        z = per_level(PLANT_PARAMETERS['initial_state'], p['initial_state'], self.model.order)
         self._d = Disturbance(p)
-        self._system = System(self._model.expressions, self._d, p['integration_step'], z)
+        self._system = System(self.model.expressions, self._d, p['integration_step'], z)
         self._random = np.random.default_rng(p['noise_seed'])
-
-    @property
-    def parameters(self) -> dict[str, Any]:
-        """All parameters with their present values; a copy."""
-        return dict(self._parameters)
-
-    @property
-    def order(self) -> int:
-        """Number of states n."""
-        return self._model.order
-
-    @property
-    def model(self) -> TriangularModel:
-        """Phi, and the names of the known inputs."""
-        return self._model
 
     def configure(self, changes: Mapping[str, Any]) -> None:
         """
         Change live parameters from now on; all or nothing.
 
-        Raises
-        ------
-        ConfigurationError
-            An unknown name, a bad value, or a parameter that can't change live.
-
+        Raises ConfigurationError for an unknown name, a bad value, or one that can't change live.
         """
         self.adopt(self.prepare(changes), 'noise_seed' in changes)
 
     def prepare(self, changes: Mapping[str, Any]) -> Parameters:
         """Return what `adopt` takes for these changes; raise as `configure`, change nothing."""
-        parameters = self._parameters.changed_live(changes, 'plant')
+        parameters = self.parameters.changed_live(changes, 'plant')
         TriangularModel.of(parameters)  # raises where it can't be used with other constants
         return parameters
 
     def adopt(self, parameters: Parameters, noise_anew: bool) -> None:
         """Go on with parameters that `prepare` has returned; the noise may begin again."""
-        self._parameters = parameters
-        self._model, self._d = TriangularModel.of(parameters), Disturbance(parameters)
-        self._system.change(self._model.expressions, self._d)
+        self.parameters = parameters
+        self.model, self._d = TriangularModel.of(parameters), Disturbance(parameters)
+        self._system.change(self.model.expressions, self._d)
         if noise_anew:
             self._random = np.random.default_rng(parameters['noise_seed'])
 
     def advance(self, t: float, u: ArrayLike = 0.0) -> None:
         """
-        Integrate up to the time `t` (s since the start), with known inputs held.
+        Integrate up to the time `t` (s since the start), with known inputs (m,) held.
 
-        Parameters
-        ----------
-        t : float
-        u : number or (m,) array
-            Known inputs.
-
-        Raises
-        ------
-        ConfigurationError
-            A time that is not finite, or another number of inputs.
-
+        Raises ConfigurationError for a time that is not finite, or another number of inputs.
         """
-        self._system.advance(t, known_inputs(u, self._model.inputs)[np.newaxis])
+        self._system.advance(t, known_inputs(u, self.model.inputs)[np.newaxis])
 
     @property
     def states(self) -> Floats:
@@ -163,13 +129,13 @@ class Plant:
             A time that is not finite, or u of another shape.
 
         """
-        z = self._system.advance(t, known_inputs(u, self._model.inputs, np.size(t)))
+        z = self._system.advance(t, known_inputs(u, self.model.inputs, np.size(t)))
         return Truth(self._measured(z[:, 0]), z, self._d.along(t))
 
     def _measured(self, z1: Any) -> Any:
-        noise = self._parameters['noise_std']
+        noise = self.parameters['noise_std']
         y = z1 + noise * self._random.standard_normal(np.shape(z1)) if noise > 0.0 else z1
-        return quantised(y, self._parameters['quantisation'])
+        return quantised(y, self.parameters['quantisation'])
 
 
 def quantised(y: Any, step: float) -> Any:
@@ -193,22 +159,10 @@ def respond(
     """
     Return states (K, n) and d (K,) of a model driven by any d(t), from t = 0: for training data.
 
-    Parameters
-    ----------
-    model : TriangularModel
-    initial_state : (n,) array
-        z at t = 0.
-    t : (K,) array
-        When to look, in seconds, not decreasing, not below 0.
-    table : (M,) array
-        d at 0, spacing, 2 spacing, ...; linear in between, constant behind the end. M >= 2.
-    spacing : float
-        Seconds.
-    u : number, (K,) or (K, m) array
-        Known input, or known inputs, held during the interval that ends at each time.
-    step : float
-        Longest step in seconds; each interval is divided evenly.
-
+    `t` (K,) are the times (s), not decreasing, from 0 on; `table` (M,) has d at 0, `spacing`,
+    2 `spacing`, .. (s), M >= 2, it is linear in between and constant behind the end; `u`, a
+    number, (K,) or (K, m), is held during the interval that ends at each time. No step is longer
+    than `step` (s); each interval is divided evenly.
     """
     d, z = Disturbance({}, table, spacing), np.broadcast_to(initial_state, model.order)
     inputs = known_inputs(u, model.inputs, np.size(t))

@@ -13,6 +13,7 @@ as well.
 """
 
 from collections.abc import Mapping
+from functools import partial
 from typing import Any, NamedTuple
 
 from fhaosmo_ros.core.model.triangular import TriangularModel
@@ -32,14 +33,9 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
-
-SHORTEST = 1e-9
-"""Stamps stay this far apart (s), as two integer nanoseconds do."""
-
+SHORTEST = 1e-9  # stamps stay this far apart (s), as two integer nanoseconds do
 SHAPES = ('sines', 'steps', 'chirp')
-SINES = 5
-"""Number of sines in a sum."""
-
+SINES = 5  # in a sum
 SHARED = tuple(
     PLANT_NODE_PARAMETERS[name]
     for name in (
@@ -50,69 +46,48 @@ SHARED = tuple(
 """A plant's YAML describes these for its family, too."""
 SENSOR = (ONLINE_PARAMETERS['measurement_delay'],)
 """An estimator's YAML describes this."""
-
+fixed = partial(Parameter, live=False)  # all of them are read once
 FAMILY = (
-    Parameter('duration', 20.0, 'Length of a recording.', unit='s', lower=0.1, upper=1e5,
-              live=False),
-    Parameter('disturbances', ['sines', 'steps', 'chirp'],
-              'Shapes of d, taken in turn: sines (five with random frequencies in band_of_d, '
-              'phases and amplitudes), steps (random levels at random times), chirp (through '
-              'band_of_d, upwards or downwards). Never one sine: gains tuned on it would '
-              'resonate at it.', choices=SHAPES, live=False, lengths='1 or more'),
-    Parameter('rms_of_d', 0.07, 'RMS of d in each recording.', lower=0.0, lower_open=True,
-              upper=1e9, live=False),
-    Parameter('band_of_d', [0.5, 8.0], 'Lowest and highest angular frequency of sines and chirp.',
-              unit='rad/s', lower=0.0, lower_open=True, upper=1e5, live=False, lengths='2'),
-    Parameter('step_interval', 3.0, 'Mean time between two steps, at least a third of it.',
-              unit='s', lower=1e-3, upper=1e5, live=False),
-    Parameter('rms_of_u', 1.0,
-              'RMS of the known input, sines in band_of_d as well, where the model uses u.',
-              lower=0.0, upper=1e9, live=False),
-    Parameter('period_jitter', 0.0,
-              'Standard deviation of the moments of sampling about the even grid; the stamps '
-              'tell.', unit='s', lower=0.0, upper=10.0, live=False),
-    Parameter('stamp_jitter', 0.0,
-              'Standard deviation of the stamps about the moments of sampling; nothing tells.',
-              unit='s', lower=0.0, upper=10.0, live=False),
-    Parameter('dropout', 0.0, 'Share of the samples that are lost.', lower=0.0, upper=0.9,
-              live=False),
-    Parameter('dropout_length', 1.0, 'Mean number of samples that are lost one after the other.',
-              lower=1.0, upper=1e6, live=False),
-    Parameter('outliers', 0.0, 'Share of the samples that are outliers.', lower=0.0, upper=1.0,
-              live=False),
-    Parameter('outlier_std', 1.0,
-              'Standard deviation of what an outlier adds to the noise of its sample (unit of '
-              'y).', lower=0.0, upper=1e9, live=False),
+    fixed('duration', 20.0, 'Length of a recording.', unit='s', lower=0.1, upper=1e5),
+    fixed('disturbances', ['sines', 'steps', 'chirp'],
+          'Shapes of d, taken in turn: sines (five with random frequencies in band_of_d, phases '
+          'and amplitudes), steps (random levels at random times), chirp (through band_of_d, '
+          'upwards or downwards). Never one sine: gains tuned on it would resonate at it.',
+          choices=SHAPES, lengths='1 or more'),
+    fixed('rms_of_d', 0.07, 'RMS of d in each recording.', lower=0.0, lower_open=True, upper=1e9),
+    fixed('band_of_d', [0.5, 8.0], 'Lowest and highest angular frequency of sines and chirp.',
+          unit='rad/s', lower=0.0, lower_open=True, upper=1e5, lengths='2'),
+    fixed('step_interval', 3.0, 'Mean time between two steps, at least a third of it.', unit='s',
+          lower=1e-3, upper=1e5),
+    fixed('rms_of_u', 1.0,
+          'RMS of the known input, sines in band_of_d as well, where the model uses u.',
+          lower=0.0, upper=1e9),
+    fixed('period_jitter', 0.0,
+          'Standard deviation of the moments of sampling about the even grid; the stamps tell.',
+          unit='s', lower=0.0, upper=10.0),
+    fixed('stamp_jitter', 0.0,
+          'Standard deviation of the stamps about the moments of sampling; nothing tells.',
+          unit='s', lower=0.0, upper=10.0),
+    fixed('dropout', 0.0, 'Share of the samples that are lost.', lower=0.0, upper=0.9),
+    fixed('dropout_length', 1.0, 'Mean number of samples that are lost one after the other.',
+          lower=1.0, upper=1e6),
+    fixed('outliers', 0.0, 'Share of the samples that are outliers.', lower=0.0, upper=1.0),
+    fixed('outlier_std', 1.0,
+          'Standard deviation of what an outlier adds to the noise of its sample (unit of y).',
+          lower=0.0, upper=1e9),
 )  # fmt: skip
-
 FAMILY_PARAMETERS = ParameterTable(MODEL, SENSOR, SHARED, FAMILY)
 
 
 class Recording(NamedTuple):
-    """
-    What a sensor would have given, and the truth at the moments of sampling.
+    """What a sensor would have given, and the truth at the moments of sampling."""
 
-    Attributes
-    ----------
-    t : (K,) array
-        Stamps in seconds, increasing.
-    y : (K,) array
-        Measured output.
-    u : (K,) or (K, m) array
-        Known input, or known inputs, of the interval that ends at each sample.
-    z : (K, n) array
-    d : (K,) array
-    shape : str
-        Of the disturbance.
-
-    """
-
-    t: Floats
-    y: Floats
-    u: Floats
-    z: Floats
-    d: Floats
-    shape: str
+    t: Floats  # (K,) stamps (s), increasing
+    y: Floats  # (K,) measured output
+    u: Floats  # (K,) or (K, m): known inputs of the interval that ends at each sample
+    z: Floats  # (K, n)
+    d: Floats  # (K,)
+    shape: str  # of the disturbance
 
 
 class Family:
@@ -132,8 +107,7 @@ class Family:
     """
 
     def __init__(self, parameters: Mapping[str, Any] | None = None) -> None:
-        self.parameters: dict[str, Any] = dict(FAMILY_PARAMETERS.complete(parameters))
-        p = self.parameters
+        p = self.parameters = FAMILY_PARAMETERS.complete(parameters)
         self.model = TriangularModel.of(p)
         self._start = per_level(
             PLANT_PARAMETERS['initial_state'], p['initial_state'], self.model.order

@@ -9,7 +9,6 @@ cdef enum Kind:
 
 
 cdef class Disturbance:
-    cdef object arguments  # it was made from
     cdef Kind kind
     cdef double amplitude  # of the wave, or height of the step (unit of d)
     cdef double omega  # angular frequency; a chirp's at t = 0 (rad/s)

@@ -19,22 +19,14 @@ KINDS = ('none', 'sine', 'step', 'square', 'chirp')
 
 cdef class Disturbance:
     """
-    A function d(t) of the time since the plant's start.
+    A function d(t) of the time since the plant's start (s).
 
-    Parameters
-    ----------
-    p : mapping
-        Checked parameters of a plant, which say what wave it is.
-    values : (M,) array, optional
-        Instead of a wave: values at 0, `spacing`, ..., M >= 2. It is linear in between and
-        constant behind the last one.
-    spacing : float
-        Seconds, > 0.
-
+    It is the wave that checked parameters of a plant say; or a table: `values`, (M,), M >= 2, at
+    0, `spacing`, ... (s), linear in between and constant behind the last one.
     """
 
     def __cinit__(self, p, values=None, double spacing=1.0):
-        self.arguments, self.spacing = (p, values, spacing), spacing
+        self.spacing = spacing
         if values is not None:
             self.kind, self.values = TABLE, np.array(values, dtype=np.float64)
             if len(self.values) < 2 or not spacing > 0.0:
@@ -43,9 +35,6 @@ cdef class Disturbance:
         self.kind = KINDS.index(p['disturbance'])
         self.amplitude, self.offset = p['disturbance_amplitude'], p['disturbance_offset']
         self.omega, self.start = p['disturbance_omega'], p['disturbance_start']
-
-    def __reduce__(self):
-        return Disturbance, self.arguments
 
     cdef double at(self, double t) noexcept nogil:
         """Return d(t)."""
@@ -77,28 +66,14 @@ cdef class Disturbance:
 
     def along(self, t):
         """Return d, (K,), at times `t` (s), (K,) or a number."""
-        cdef const double[::1] times = np.ascontiguousarray(t, dtype=np.float64)
-        cdef double[::1] d = np.empty(times.shape[0])
-        cdef Py_ssize_t k
-        for k in range(times.shape[0]):
-            d[k] = self.at(times[k])
-        return np.asarray(d)
+        return np.array([self.at(time) for time in np.ravel(t)], dtype=np.float64)
 
 
 cdef class System(Dynamics):
     """
     A triangular system that d drives, integrated by the classical Runge-Kutta method.
 
-    Parameters
-    ----------
-    phi : Expressions
-        Phi_1 .. Phi_n.
-    d : Disturbance
-    h : float
-        Step (s).
-    z : (n,) array
-        States at t = 0.
-
+    `phi` are Phi_1 .. Phi_n, `h` is the step (s), and `z`, (n,), are the states at t = 0.
     """
 
     def __cinit__(self, Expressions phi not None, Disturbance d not None, double h, z):
@@ -111,13 +86,6 @@ cdef class System(Dynamics):
         for i in range(self.size):
             self.on_grid[i] = self.z[i] = z[i]
 
-    def __reduce__(self):
-        values = {'taken': self.taken, 'on_grid': self.on_grid, 'z': self.z}
-        return System, (self.phi, self.d, self.h, self.states), values
-
-    def __setstate__(self, values):
-        self.taken, self.on_grid, self.z = values['taken'], values['on_grid'], values['z']
-
     def change(self, Expressions phi not None, Disturbance d not None):
         """Go on with other functions of as many states and known inputs."""
         if phi.count != self.size or phi.states > self.size or phi.inputs != self.phi.inputs:
@@ -129,7 +97,7 @@ cdef class System(Dynamics):
         """States at the time of the latest `advance`, (n,)."""
         return np.array([self.z[i] for i in range(self.size)])
 
-    cdef void rates(self, int stage, double t, const double* x, double* slope) noexcept nogil:
+    cdef void rates(self, double t, const double* x, double* slope) noexcept nogil:
         """Write z_i' = z_{i+1} + Phi_i(z, u), z_n' = d(t) + Phi_n(z, u)."""
         cdef int i, last = self.size - 1
         for i in range(self.size):
@@ -163,16 +131,10 @@ cdef class System(Dynamics):
         """
         Return the states at many times, (K, n).
 
-        Parameters
-        ----------
-        t : (K,) array or number
-            Times since t = 0 (s), finite and not decreasing.
-        u : (K, m) array
-            Known inputs of the interval that ends at each.
-        on_grid : bool
-            Steps lie on the grid of time. Else, for a run from t = 0 on, each interval is divided
-            evenly, so that a step has one value of each known input.
-
+        `t`, (K,) or a number, are times since t = 0 (s), finite and not decreasing; `u`, (K, m),
+        are the known inputs of the interval that ends at each. Steps lie on the grid of time;
+        else, for a run from t = 0 on, each interval is divided evenly, so that a step has one
+        value of each known input.
         """
         cdef const double[::1] times = np.ascontiguousarray(t, dtype=np.float64)
         cdef const double[:, ::1] inputs = u

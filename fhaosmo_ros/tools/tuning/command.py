@@ -2,30 +2,36 @@
 """Find gains of the estimator that fit a sensor, a plant and a family of disturbances."""
 
 import argparse
+from collections.abc import Iterable, Iterator, Sequence
+import math
 import os
 from pathlib import Path
 from typing import Any
 
+from fhaosmo_ros import __version__
 from fhaosmo_ros.core.model.triangular import TriangularModel
 from fhaosmo_ros.core.parameters.declaration import ParameterTable
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
-from fhaosmo_ros.core.parameters.files import load
+from fhaosmo_ros.core.parameters.files import dumps, load
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS, MODEL
+from fhaosmo_ros.core.simulation.metrics import rms
 from fhaosmo_ros.core.simulation.recordings import SENSOR
 from fhaosmo_ros.stop_signals import Stop
 from fhaosmo_ros.tools.bags.reader import BagReader
 from fhaosmo_ros.tools.bags.recorded import BagInputs
 from fhaosmo_ros.tools.cli.command import add_value_options, output_at, run_command, values_of
-from fhaosmo_ros.tools.tuning import report
-from fhaosmo_ros.tools.tuning.identify import Identification
+from fhaosmo_ros.tools.tuning.identify import Identification, SURE
 from fhaosmo_ros.tools.tuning.linear_gains import chosen_otherwise
-from fhaosmo_ros.tools.tuning.objective import TUNE_PARAMETERS
-from fhaosmo_ros.tools.tuning.tuner import simulated, Tuner
+from fhaosmo_ros.tools.tuning.search import finished
+from fhaosmo_ros.tools.tuning.tuner import simulated, TUNE_PARAMETERS, Tuner
+import numpy as np
 
-TRIALS = 1000
+SMALL_CORRELATION, UNLIKELY = 0.05, 0.01
 BOTH = ParameterTable(
     TUNE_PARAMETERS.values(), ESTIMATOR_PARAMETERS.values(), ESTIMATOR_PARAMETERS.families
 )
+Found = tuple[dict[str, Any], str]
+"""Parameters of the estimator, and a report of them."""
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -51,7 +57,7 @@ def main(argv: list[str] | None = None) -> int:
     )  # fmt: skip
     add = parser.add_argument_group('from simulated recordings').add_argument
     add(
-        '--trials', type=int, default=TRIALS, metavar='N',
+        '--trials', type=int, default=1000, metavar='N',
         help='that the study shall hold at the end (default: %(default)s)',
     )  # fmt: skip
     add('--jobs', type=int, metavar='N', help='trials at a time (default: one a core)')
@@ -76,43 +82,16 @@ def _tune(arguments: argparse.Namespace, stop: Stop) -> None:
             with stop.raising():
                 parameters, text = _of_bag(arguments.bag, estimator, tuning)
         else:
-            values = TUNE_PARAMETERS.complete(tuning)
-            with stop.raising():
-                training, held_out = simulated(values, arguments.seed)
-                print(f'{len(training)} recordings to train on, {len(held_out)} held out')
-                tuner = Tuner(training, estimator, values, arguments.seed)
-            jobs = arguments.jobs or os.cpu_count() or 1
-            study = tuner.search(arguments.trials, jobs, arguments.storage, stop.is_set)
-            parameters, text = report.of_search(tuner, study, held_out)
-        report.save(folder, arguments.command_line, parameters, text)
+            parameters, text = _of_search(arguments, estimator, tuning, stop)
+        folder.mkdir()
+        head = f'    python -m fhaosmo_ros {arguments.command_line}\n\n(fhaosmo_ros {__version__})'
+        page = f'{head}\n\n{text}\n'
+        (folder / 'report.md').write_text(f'# Tuning\n\n{page}', 'utf-8')
+        comment = ''.join(f'# {line}'.rstrip() + '\n' for line in page.splitlines())
+        (folder / 'gains.yaml').write_text(comment + dumps(parameters), 'utf-8')
     gains = arguments.output / 'gains.yaml'
     print(f'\n{text}\n\noutput: {gains}, report.md')
     print(f'use it: ros2 run fhaosmo_ros estimator --ros-args --params-file {gains}')
-
-
-def _of_bag(
-    path: Path, estimator: dict[str, Any], tuning: dict[str, Any]
-) -> tuple[dict[str, Any], str]:
-    """Return the gains for what the y of a bag shows, and a report of them."""
-    if others := chosen_otherwise(estimator):
-        raise ConfigurationError(
-            f'--bag: expected gains of structure levant, got {", ".join(others)} set. Leave that '
-            'out; or tune by a simulated family: without --bag, with noise_std, rms_of_d and '
-            'band_of_d as this command finds them'
-        )
-    given = ParameterTable(MODEL).part_of(tuning) | estimator
-    values = ESTIMATOR_PARAMETERS.complete(given)
-    given |= {name: values[name] for name in ('order', 'phi')}
-    model = TriangularModel.of(values)
-    with BagReader(path) as reader:
-        inputs = BagInputs(reader, values, model)
-        samples, field = inputs.samples()
-        if field.wraps:
-            samples = samples.unwrapped()
-        u = inputs.at(samples)
-    t = (samples.stamps - samples.stamps[0]) * 1e-9
-    found = Identification((t, samples.values, u), model, values, given)
-    return report.of_bag(found, path.resolve().name)
 
 
 def read_parameters(files: list[Path], rules: list[str]) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -128,3 +107,106 @@ def read_parameters(files: list[Path], rules: list[str]) -> tuple[dict[str, Any]
     given = BOTH.coerce(values_of(rules))
     estimator |= ESTIMATOR_PARAMETERS.part_of(given)
     return estimator, tuning | TUNE_PARAMETERS.part_of(given)
+
+
+def _of_search(
+    arguments: argparse.Namespace, estimator: dict[str, Any], tuning: dict[str, Any], stop: Stop
+) -> Found:
+    """Search gains for a simulated family of recordings."""
+    values = TUNE_PARAMETERS.complete(tuning)
+    with stop.raising():
+        training, held_out = simulated(values, arguments.seed)
+        print(f'{len(training)} recordings to train on, {len(held_out)} held out')
+        tuner = Tuner(training, estimator, values, arguments.seed)
+    jobs = arguments.jobs or os.cpu_count() or 1
+    study = tuner.search(arguments.trials, jobs, arguments.storage, stop.is_set)
+    start = tuner.parameters({d.name: d.start for d in tuner.space})
+    tuned = tuner.parameters(study.best_params)
+    columns, found = [''], []
+    for title, parameters in (('start', start), ('tuned', tuned)):
+        columns += [f'{title}, training', f'{title}, held out']
+        found += [tuner.objective(parameters), tuner.objective(parameters, held_out)]
+    rows = [['error, relative to the truth', *(f'{error:.4f}' for error, _ in found)]]
+    names = [*(f'z{k}' for k in range(1, len(tuner.objective.scale))), 'd']
+    for name, of_name in zip(names, zip(*(rms(e) for _, e in found), strict=True), strict=True):
+        rows.append([f'RMS error of {name}', *(f'{error:.3g}' for error in of_name)])
+    text = (
+        f'{finished(study)} trials on {len(training)} simulated recordings; '
+        f'{len(held_out)} others, held out, took no part in the search.'
+    )
+    return tuned, f'{text}\n\n{markdown(columns, rows)}'
+
+
+def _of_bag(path: Path, estimator: dict[str, Any], tuning: dict[str, Any]) -> Found:
+    """Find the gains for what the y of a bag shows."""
+    if others := chosen_otherwise(estimator):
+        raise ConfigurationError(
+            f'--bag: expected gains of structure levant, got {", ".join(others)} set. Leave that '
+            'out; or tune by a simulated family: without --bag, with noise_std, rms_of_d and '
+            'band_of_d as this command finds them'
+        )
+    given = ParameterTable(MODEL).part_of(tuning) | estimator
+    values = ESTIMATOR_PARAMETERS.complete(given)
+    given |= {name: values[name] for name in ('order', 'phi')}
+    with BagReader(path) as reader:
+        inputs = BagInputs(reader, values, TriangularModel.of(values))
+        samples, field = inputs.samples()
+        if field.wraps:
+            samples = samples.unwrapped()
+        u = inputs.at(samples)
+    t = (samples.stamps - samples.stamps[0]) * 1e-9
+    found = Identification((t, samples.values, u), values, given)
+    best, (parameters, expected) = found.best, found.gains()
+    size, white = found.size_of_input(best.design, best.noise), found.whiteness()
+    seconds, share = found.samples.h.sum(), expected[-1] / size
+    rows = [
+        (f'samples in {path.resolve().name}', f'{len(found.samples.y)} in {seconds:.1f} s'),
+        ('noise of y (standard deviation)', f'{best.noise:.4g}' + ' (given)' * found.fixed),
+        ('size of d (RMS)', f'{size:.4g}'),
+        ('time in which d changes (1/kappa), s', f'{1.0 / best.design.decay:.4g}'),
+        ('derivatives of d that are followed', f'{best.design.derivatives}'),
+        *((f'expected error of z{i}', f'{x:.3g}') for i, x in enumerate(expected[:-1], 1)),
+        ('expected error of d', f'{expected[-1]:.3g} ({share:.2f} of its size)'),
+        ('probability that innovations are white (Ljung-Box)', f'{white[1]:.2g}'),
+    ]
+    told = [f'Note: {text}' for text in notes(found, *white)]
+    text = '\n\n'.join([markdown(['found in y', ''], rows), *told])
+    return ESTIMATOR_PARAMETERS.part_of(parameters), text
+
+
+def notes(found: Identification, correlation: float, probability: float) -> Iterator[str]:
+    """Say what a user should know before trusting the gains."""
+    samples, model, whole = found.samples, found.model, float(found.samples.h.sum())
+    if found.quantum > 2.0 * found.best.noise:
+        yield (
+            f'y comes in steps of {found.quantum:.3g}, larger than its noise: the '
+            'error of the steps is not random. docs/recipes.md says what helps.'
+        )
+    if found.outliers:
+        yield (
+            f'{found.outliers} samples ({found.outliers / len(samples.y):.2%}) are outliers. They '
+            'were left out; the estimator rejects such samples, too.'
+        )
+    rates = model.jacobian(np.zeros(model.order)) + np.eye(model.order, k=1)
+    growth = float(np.linalg.eigvals(rates).real.max())
+    if growth * whole > SURE:
+        yield (
+            f'The model is unstable: at rest, without d, it grows tenfold within '
+            f'{math.log(10.0) / growth:.2g} s, but y has stayed within {samples.y.min():.3g} and '
+            f'{samples.y.max():.3g} for {whole:.0f} s. If no controller holds this plant, then a '
+            'sign in phi is wrong; if one does, its command should be a known input, or d '
+            'contains it.'
+        )
+    if probability < UNLIKELY and abs(correlation) > SMALL_CORRELATION:
+        yield (
+            f'Innovations are not white: they correlate by {correlation:+.2f} with earlier '
+            'ones. The model of the plant, of d or of the noise does not quite fit; the gains are '
+            'the best of their kind, but standard deviations are too small. '
+            '`gains: self_tuning` follows noise that is coloured.'
+        )
+
+
+def markdown(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Return a Markdown table."""
+    lines = [head, ['---'] * len(head), *rows]
+    return '\n'.join(f'| {" | ".join(cells)} |' for cells in lines)

@@ -25,44 +25,28 @@ from scipy.stats import chi2, median_abs_deviation
 
 Floats = NDArray[np.float64]
 Recorded = tuple[Floats, Floats, Floats]
-DERIVATIVES = (0, 1, 2, 3)
-FIRST = np.geomspace(2e-4, 2.0, 15)
-"""Bandwidths (rad a sample) of the filters at the likeliest of which the search begins."""
-SLOWEST, QUICKEST = 1e-5, 3.0
-"""Bandwidths of the filters, in rad a sample."""
-STEPS = np.array([0.3, 0.5])
-"""Sides of the first simplex in ln bandwidth (rad a sample) and ln ratio."""
-BOUNDS = np.log([[SLOWEST, QUICKEST], [1e-3, 30.0]])
-"""Of these."""
+"""Stamps from the first one on (s), (K,); y, (K,); known inputs, (K, m)."""
+FEWEST = 500  # samples
+FEWEST_STEPS = 20  # changes of y that say a quantum
+ON_GRID = 0.02  # how close values on a grid are to multiples of the quantum, relatively
+SLOWEST, QUICKEST = 1e-5, 3.0  # bandwidths of the filters (rad a sample)
+FIRST = np.geomspace(2e-4, 2.0, 15)  # at the likeliest of these the search begins
+STEPS = np.array([0.3, 0.5])  # sides of the first simplex in ln bandwidth and ln ratio ..
+BOUNDS = np.log([[SLOWEST, QUICKEST], [1e-3, 30.0]])  # .. and bounds of these
 EVALUATIONS = 120
-WORTH = 3.0
-"""By so much a richer model must raise the log-likelihood."""
-OUTLIER, LONGEST_RUN = 6.0, 3
-"""An outlier has an innovation of so many standard deviations; so many of them may follow."""
-MOST_OUTLIERS = 0.05
-CLIP = 3.0
-"""Standard deviations from which on an innovation counts linearly (Huber 1964)."""
-SETTLED = 8.0
-"""Time constants of the filter after which its covariance is steady."""
-LEAST_USED = 0.9
-"""Part of the samples that needs a finite innovation."""
-STILL = 0.03
-"""Bandwidth of a filter that takes d for 0, over the bag's length."""
-LAGS = 20
-SURE = 10.0
-"""A difference of log-likelihoods that is no accident."""
-FEWEST = 500
-"""Samples."""
-FEWEST_STEPS = 20
-"""Changes of y that say a quantum."""
-ON_GRID = 0.02
-"""Values count as quantised if they are this close to multiples of the quantum, relatively."""
-UNSEEN = 0.97
-"""Expected error of d over its size from which on an estimate tells nothing."""
-NO_NOISE = 1e-7
-"""Noise over the size of y below which y is a simulated one without noise."""
-BEGIN = 0.1
-"""Part of the bag in which the estimates may still be settling."""
+DERIVATIVES = (0, 1, 2, 3)
+WORTH = 3.0  # by so much a richer model must raise the log-likelihood
+CLIP = 3.0  # standard deviations from which on innovations count linearly (Huber 1964)
+SETTLED = 8.0  # time constants of the filter after which its covariance is steady
+LEAST_USED = 0.9  # part of the samples that needs a finite innovation
+OUTLIER, LONGEST_RUN, MOST_OUTLIERS = 6.0, 3, 0.05
+"""Standard deviations of an outlier's innovation, how many may follow, and their largest share."""
+STILL = 0.03  # bandwidth of a filter that takes d for 0, over the bag's length
+SURE = 10.0  # a difference of log-likelihoods that is no accident
+NO_NOISE = 1e-7  # noise over the size of y below which y is a simulated one without noise
+UNSEEN = 0.97  # expected error of d over its size from which on an estimate tells nothing
+BEGIN = 0.1  # part of the bag in which the estimates may still be settling
+LAGS = 20  # samples, of the autocorrelations of innovations
 
 
 class Samples(NamedTuple):
@@ -79,13 +63,8 @@ class Design(NamedTuple):
     """A model of d and of the noise, but for the size of both."""
 
     derivatives: int  # k of D 17
-    bandwidth: float  # omega of the filter in rad/s, which says q (D 30)
-    ratio: float  # kappa / omega
-
-    @property
-    def decay(self) -> float:
-        """Rate kappa (1/s) of d."""
-        return self.ratio * self.bandwidth
+    bandwidth: float  # omega of the filter (rad/s), which says q (D 30)
+    decay: float  # kappa, of d (1/s)
 
 
 class Evaluation(NamedTuple):
@@ -102,43 +81,16 @@ class Identification:
     """
     The likeliest noise and model of d of a recorded y.
 
-    Parameters
-    ----------
-    recorded : arrays
-        Stamps from the first one on (s), (K,); y, (K,); known inputs, (K, m).
-    model : TriangularModel
-    values : Parameters
-        Of the estimator, complete.
-    given : mapping
-        Those of them that the user set: `noise_size`, `unknown_input_derivatives` and
-        `unknown_input_decay` are not estimated then.
-
-    Attributes
-    ----------
-    samples : Samples
-        Those that are usable.
-    period : float
-        Of sampling (s).
-    quantum : float
-        Of y; 0 for none that shows.
-    fixed : bool
-        The noise is given.
-    outliers : int
-        Samples that were left out.
-    best : Evaluation
-        Of the likeliest design.
-
-    Raises
-    ------
-    ConfigurationError
-        There are no gains for this y; the text says why.
-
+    `values` are all parameters of the estimator; those that the user set are `given`, and
+    `noise_size`, `unknown_input_derivatives` and `unknown_input_decay` among these are not
+    estimated. `best` is the evaluation of the likeliest design on the usable `samples`, of which
+    `outliers` were left out. Raises ConfigurationError where there are no gains for this y, and
+    says why.
     """
 
     def __init__(
         self,
         recorded: Recorded,
-        model: TriangularModel,
         values: Parameters,
         given: Mapping[str, Any],
     ) -> None:
@@ -153,8 +105,9 @@ class Identification:
                 'can be learned from it. Record while the plant moves'
             )
         h = np.diff(t, prepend=t[0])
-        self.model, self._given = model, given
-        self.period = period = float(np.median(h[1:]))
+        model = self.model = TriangularModel.of(values)
+        self._given = given
+        self.period = period = float(np.median(h[1:]))  # of sampling (s)
         periods = np.maximum(np.round(h / period), 1.0).astype(np.int64)
         periods[h > max(values['max_gap'] or GAP_SAMPLES * period, 3.0 * period)] = periods[0] = 0
         used = np.ones(count, dtype=bool)
@@ -170,11 +123,12 @@ class Identification:
             sizes.append(3.0 * rms(slow))
         self._sizes = np.array(sizes)
         # The noise: a smooth signal vanishes in differences of high order.
-        self.quantum = quantum(y)
+        self.quantum = quantum(y)  # 0 for none that shows
         self._rounding = self.quantum / math.sqrt(12.0)
         rough = float(median_abs_deviation(np.diff(y, 4), scale='normal')) / math.sqrt(70.0)
         guess = max(rough, self._rounding, 1e-9 * float(np.std(y)))
-        self._noise, self.fixed = given.get('noise_size') or guess, bool(given.get('noise_size'))
+        self.fixed = bool(given.get('noise_size'))  # else the noise is estimated, too
+        self._noise = given.get('noise_size') or guess
         self._clip = math.inf  # standard deviations, of the innovations by which it corrects
         with progress(unit='filter', desc='likelihood', leave=False) as self._bar:
             start = self._start()
@@ -236,7 +190,7 @@ class Identification:
 
     def _start(self) -> Evaluation:
         """Scan bandwidths, and bring the scale of clipping and the sizes about."""
-        designs = [Design(1, float(w) / self.period, 0.5) for w in FIRST]
+        designs = [Design(1, speed, 0.5 * speed) for speed in (FIRST / self.period).tolist()]
         best = max(map(self.evaluate, designs), key=lambda e: e.log_likelihood)
         self._clip = CLIP
         for _ in range(2):
@@ -260,16 +214,17 @@ class Identification:
 
     def _fit(self, design: Design) -> Evaluation:
         """Return the likeliest design around this one (Nelder and Mead 1965)."""
-        decay = self._given.get('unknown_input_decay')
+        given = self._given.get('unknown_input_decay')
 
         def at(point: Floats) -> Evaluation:
-            """Evaluate at ln bandwidth (rad a sample) and, unless decay is given, ln ratio."""
+            """Evaluate at ln bandwidth (rad a sample), and ln ratio of the decay to bandwidth."""
             bandwidth = math.exp(point[0]) / self.period
-            ratio = decay / bandwidth if decay else math.exp(point[1])
-            return self.evaluate(design._replace(bandwidth=bandwidth, ratio=ratio))
+            decay = given or math.exp(point[1]) * bandwidth
+            return self.evaluate(Design(design.derivatives, bandwidth, decay))
 
-        count = 1 if decay else 2
-        start = np.log([design.bandwidth * self.period, design.ratio])[:count]
+        count = 1 if given else 2
+        ratio = design.decay / design.bandwidth
+        start = np.log([design.bandwidth * self.period, ratio])[:count]
         found = minimize(
             lambda point: min(-at(point).log_likelihood, 1e300), start, method='Nelder-Mead',
             bounds=BOUNDS[:count],
@@ -299,7 +254,8 @@ class Identification:
                 'order or phi are wrong; then correct the model, or sample faster'
             )
         still = STILL / float(self.samples.h.sum())
-        without = self.evaluate(self.best.design._replace(bandwidth=still))
+        k, _, decay = self.best.design
+        without = self.evaluate(Design(k, still, decay / bandwidth * still))
         if self.best.log_likelihood - without.log_likelihood < SURE:
             raise ConfigurationError(
                 f'd: expected a y that d moves, got one that the model explains with d = 0 (noise '
@@ -326,19 +282,9 @@ class Identification:
         """
         Return the gains of the steady Kalman filter of what was found (D 17 to D 19).
 
-        Returns
-        -------
-        dict
-            Parameters of the estimator.
-        (n + 1,) array
-            Standard deviations of the errors of z and d that are to be expected.
-
-        Raises
-        ------
-        ConfigurationError
-            The estimate of d would tell nothing, or there is no such filter in floating-point
-            numbers.
-
+        They are parameters of the estimator; behind them are the expected standard deviations of
+        the errors of z and d, (n + 1,). Raises ConfigurationError where the estimate of d would
+        tell nothing, or there is no such filter in floating-point numbers.
         """
         best, order, period = self.best, self.model.order, rounded(self.period)
         noise, begin = rounded(best.noise), int(BEGIN * len(self.samples.y))
@@ -376,7 +322,7 @@ def usable(t: Floats, y: Floats, u: Floats) -> Recorded:
     """Return the samples that are finite and later than all before them."""
     finite = np.isfinite(np.column_stack([t, y, u])).all(axis=1)
     latest = np.maximum.accumulate(np.where(finite, t, -np.inf))
-    keep = finite & (t > np.concatenate([[-np.inf], latest[:-1]])[: len(t)])
+    keep = finite & (t > np.append(-np.inf, latest[:-1]))
     return t[keep], y[keep], u[keep]
 
 

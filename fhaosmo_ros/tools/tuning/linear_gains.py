@@ -28,48 +28,29 @@ WIDTH = 16.0
 Half-width over the noise: nearly linear for the noise itself, and outliers count as a few standard
 deviations of it.
 """
-GAMMA = 3e-3
-"""Power at which the injections are nearly linear in the innovation."""
-SMALLEST = 1e-12
-"""Stands for 1 - K_1 of a deadbeat observer."""
-LEAST = 1e-30
-"""Gain that stands for one that is not positive."""
+GAMMA = 3e-3  # power at which the injections are nearly linear in the innovation
+SMALLEST = 1e-12  # stands for 1 - K_1 of a deadbeat observer
+LEAST = 1e-30  # gain that stands for one that is not positive
 
 
 def chosen_otherwise(estimator: Mapping[str, Any]) -> list[str]:
     """Return the parameters, as set by the user, that ask for something else than `SCHEME`."""
-    found = [k for k in ('structure', 'scheme') if estimator.get(k, SCHEME[k]) != SCHEME[k]]
-    if not estimator.get('unknown_input', True):
-        found.append('unknown_input')
-    # Such values fit one structure and scheme.
-    return found + [
-        k for k in ('lambda', 'alpha', 'epsilon', 'initial_internal') if k in estimator
-    ]
+    wanted = {**SCHEME, 'unknown_input': True}
+    differ = ('structure', 'scheme', 'unknown_input')
+    found = [name for name in differ if estimator.get(name, wanted[name]) != wanted[name]]
+    fit_one_scheme = ('lambda', 'alpha', 'epsilon', 'initial_internal')
+    return found + [name for name in fit_one_scheme if name in estimator]
 
 
 def kalman_gains(p: Mapping[str, Any], period: float) -> tuple[Floats, Floats]:
     """
     Return lambda with which predict_correct is the Kalman filter that parameters ask for (D 19).
 
-    Parameters
-    ----------
-    p : mapping
-        Of the observer, complete: its model, noise_size, the model of d, the first of fuzzy_widths
-        for all levels, and gamma_initial.
-    period : float
-        Sampling period (s).
-
-    Returns
-    -------
-    lambdas : (N,) array
-    errors : (N,) array
-        Standard deviations of the errors of the filter's estimates, once they are steady.
-
-    Raises
-    ------
-    ConfigurationError
-        There is no such filter in floating-point numbers, or psi is 0 at the size of the noise.
-
+    `p` are all of the observer's: its model, noise_size, the model of d, the first of fuzzy_widths
+    for all levels, and gamma_initial; `period` is that of sampling (s). Behind the (N,) lambda are
+    the standard deviations of the errors of the filter's estimates, once they are steady. Raises
+    ConfigurationError where there is no such filter in floating-point numbers, or psi is 0 at the
+    size of the noise.
     """
     model = TriangularModel.of(p)
     uncertainty = Uncertainty(model, p, np.zeros(model.order))

@@ -15,10 +15,8 @@ from fhaosmo_ros.core.parameters.errors import ConfigurationError
 
 Values = dict[str, float]
 
-BAD = 1e9
-"""Stands for an objective that is not finite: larger than any, and the sampler accepts it."""
-SIGMA = 0.1
-"""Standard deviation of the first proposals, as a share of each dimension's range."""
+BAD = 1e9  # for an objective that is not finite: larger than any, and the sampler accepts it
+SIGMA = 0.1  # standard deviation of the first proposals, as a share of each dimension's range
 
 
 class Dimension(NamedTuple):
@@ -45,28 +43,13 @@ def minimise(
     """
     Minimise an objective; return the study of Optuna, with `best_params` and `best_value`.
 
-    Parameters
-    ----------
-    objective : callable
-        From values by name to a number; one that is not finite counts as `BAD`.
-    space : sequence of Dimension
-    trials : int
-        Evaluations that the study shall hold at the end, with those that are in it already, also
-        of other processes. The first one is at the start of each dimension.
-    seed : int
-        With one job and no storage, the result is a function of it.
-    storage, name : str, optional
-        As for `optuna.create_study`; in memory by default.
-    jobs : int
-        Threads: an objective should spend its time in compiled code without the GIL.
-    on_trial : callable
-        Called after each trial of this process; True ends the search with the best one so far.
-
-    Raises
-    ------
-    ConfigurationError
-        Optuna cannot use the storage, or is not installed.
-
+    The objective takes values by name; a result that is not finite counts as `BAD`. `trials` says
+    how many evaluations the study shall hold at the end, with those that are in it already, also
+    of other processes; the first one is at the start of each dimension. `storage` and `name` are
+    as for `optuna.create_study`, in memory by default. With one job and no storage the result is a
+    function of `seed`; more `jobs` are threads, so an objective should spend its time in compiled
+    code without the GIL. `on_trial` is called after each trial of this process; True ends the
+    search. Raises ConfigurationError if Optuna cannot use the storage, or is not installed.
     """
     try:  # here, as only this search needs them: a robot may lack them
         import cmaes  # noqa: F401 (Optuna imports it, later)

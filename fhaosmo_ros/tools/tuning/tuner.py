@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-The search for gains on simulated recordings: from recordings and parameters to the best gains.
+The search for gains on simulated recordings, and what a set of gains is worth there.
 
 Where the user sets no other structure or scheme, and no lambda, the start is a Kalman filter for
 a model of d (D 19): how many derivatives of d to follow, and how fast d changes, are tried on a
@@ -17,11 +17,21 @@ from typing import Any
 
 from fhaosmo_ros.core.observer.configuration import FIXED_GAMMA, of_level
 from fhaosmo_ros.core.observer.observer import Observer
-from fhaosmo_ros.core.parameters.declaration import Parameters
+from fhaosmo_ros.core.online.estimator import OnlineEstimator
+from fhaosmo_ros.core.parameters.declaration import Parameters, ParameterTable
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
-from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS, OBSERVER_PARAMETERS
+from fhaosmo_ros.core.parameters.tables import (
+    ESTIMATOR_PARAMETERS,
+    OBSERVER_PARAMETERS,
+    ONLINE_PARAMETERS,
+)
 from fhaosmo_ros.core.simulation.metrics import rms
-from fhaosmo_ros.core.simulation.recordings import Family, FAMILY_PARAMETERS, Recording
+from fhaosmo_ros.core.simulation.recordings import (
+    Family,
+    FAMILY_PARAMETERS,
+    fixed,
+    Recording,
+)
 from fhaosmo_ros.tools.cli.command import progress
 from fhaosmo_ros.tools.tuning.linear_gains import (
     chosen_otherwise,
@@ -31,10 +41,26 @@ from fhaosmo_ros.tools.tuning.linear_gains import (
     SCHEME,
     WIDTH,
 )
-from fhaosmo_ros.tools.tuning.objective import Objective
 from fhaosmo_ros.tools.tuning.search import Dimension, minimise, Values
 import numpy as np
+from numpy.typing import NDArray
 
+Floats = NDArray[np.float64]
+TUNING = (
+    fixed('recordings', 36, 'Number of recordings that the search sees.', lower=1, upper=10_000),
+    fixed('held_out', 36,
+          'Number of other recordings, with other seeds, that only the report sees.', lower=1,
+          upper=10_000),
+    fixed('settled', 5.0, 'Errors count from this time of a recording on.', unit='s', lower=0.0,
+          upper=1e5),
+    fixed('weights', [1.0],
+          'Weight of the error of each estimate, squared and relative to the RMS of its truth.',
+          lower=0.0, upper=1e9, lengths='1 (d alone) or n + 1 (z1 .. zn, d)'),
+)  # fmt: skip
+TUNE_PARAMETERS = ParameterTable(FAMILY_PARAMETERS.values(), FAMILY_PARAMETERS.families, TUNING)
+"""All that `tune` takes beside the estimator's parameters."""
+FIRST_STAMP = 1_000_000_000  # ns, of a recording's first sample; 0 is that of a stamp not set
+SMALLEST = 1e-12  # smaller relative errors count as this one: their logarithm is finite
 HELD_OUT_SEED = 1_000_003
 """Added to the seed: held-out recordings share no random number with the others."""
 MODEL_OF_D = ('unknown_input_size', 'unknown_input_decay')
@@ -44,8 +70,7 @@ GRID: dict[str, Sequence[float]] = {
     'unknown_input_derivatives': DERIVATIVES,
     'unknown_input_decay': RATES,  # 1/s
 }
-DECADES = 3.0
-"""Powers of ten around its start to which a search in logarithms goes."""
+DECADES = 3.0  # powers of ten around its start to which a search in logarithms goes
 LOST_TIME, LOST_SAMPLES = 0.1, 20
 """
 Seconds, and at least so many samples, for which the innovation exceeds the largest half-width
@@ -63,24 +88,81 @@ def simulated(values: Parameters, seed: int) -> tuple[list[Recording], list[Reco
     )
 
 
+def stamps_of(t: Floats) -> NDArray[np.int64]:
+    """Return stamps (ns) for times since the first sample (s)."""
+    return FIRST_STAMP + np.round(t * 1e9).astype(np.int64)
+
+
+class Objective:
+    """
+    Evaluates parameters of the estimator on recordings to train on, by the node's code.
+
+    `tuning` has values of `TUNING`. Errors are divided by `scale`, (n + 1,): the RMS values of the
+    recordings' z and d. Raises ConfigurationError for a recording that is too short, or weights
+    that do not fit.
+    """
+
+    def __init__(self, recordings: Sequence[Recording], tuning: Mapping[str, Any]) -> None:
+        self.recordings, self._settled = recordings, tuning['settled']
+        shortest = min(r.t[-1] - r.t[0] for r in recordings)
+        if shortest <= self._settled:
+            raise ConfigurationError(
+                f'recording: expected more than {self._settled:g} s (settled), got {shortest:g} s'
+            )
+        late = [np.column_stack([r.z, r.d])[r.t - r.t[0] >= self._settled] for r in recordings]
+        self.scale = rms(np.concatenate(late))
+        weights, count = tuning['weights'], len(self.scale)
+        if len(weights) not in (1, count) or not sum(weights) > 0.0:
+            raise TUNE_PARAMETERS['weights'].error(
+                weights, f'1 or {count} numbers, not all of them 0'
+            )
+        self._weights = np.zeros(count)
+        self._weights[-len(weights) :] = np.array(weights) / sum(weights)
+
+    def __call__(
+        self, parameters: Mapping[str, Any], held_out: Sequence[Recording] = ()
+    ) -> tuple[float, Floats]:
+        """
+        Return what parameters are worth, and RMS errors of z_1 .. z_n and d, a row a recording.
+
+        The first is the weighted RMS error relative to the RMS of the truth. It is the geometric
+        mean over the recordings, so that an error smaller by a tenth counts the same on an easy
+        recording and on a hard one. Raises ConfigurationError as `OnlineEstimator`, and for
+        another model than that of the recordings.
+        """
+        estimator = OnlineEstimator(ONLINE_PARAMETERS.part_of(parameters))
+        order, states = estimator.observer.order, len(self.scale) - 1
+        if order != states:
+            raise ConfigurationError(
+                f"'order': expected {states}, the states of the plant's recordings, got {order}"
+            )
+        errors = np.array([self._judge(estimator, r) for r in held_out or self.recordings])
+        used = self._weights > 0.0
+        with np.errstate(over='ignore', divide='ignore'):  # of a truth that is 0 throughout
+            relative = np.square(errors[:, used] / self.scale[used])
+        each = np.sqrt(relative @ self._weights[used])
+        return float(np.exp(np.mean(np.log(np.maximum(each, SMALLEST))))), errors
+
+    def _judge(self, estimator: OnlineEstimator, r: Recording) -> Floats:
+        """Return the errors of z and d."""
+        estimator.reset()
+        u = r.u if estimator.observer.used_inputs else None
+        found = estimator.run(stamps_of(r.t - r.t[0]), r.y, u)
+        t = r.t[0] + (found.t - FIRST_STAMP) * 1e-9  # before the sample's, if that is delayed
+        late = t - r.t[0] >= self._settled
+        truth = np.column_stack([np.interp(t[late], r.t, x) for x in (*r.z.T, r.d)])
+        with np.errstate(over='ignore', invalid='ignore'):
+            errors = rms(np.column_stack([found.z, found.unknown_input])[late] - truth)
+        # An estimate that is not finite is infinitely wrong, not undefined.
+        return np.nan_to_num(errors, nan=np.inf)
+
+
 class Tuner:
     """
     A search: where it begins, what is tried, and what comes of it.
 
-    Parameters
-    ----------
-    training : list of Recording
-    estimator : mapping
-        What the user set for the estimator.
-    tuning : mapping
-        Of `TUNE_PARAMETERS`, complete.
-    seed : int
-
-    Raises
-    ------
-    ConfigurationError
-        Parameters that do not fit together, or recordings that do not fit them.
-
+    `estimator` has what the user set for the estimator, `tuning` all of `TUNE_PARAMETERS`. Raises
+    ConfigurationError for parameters that do not fit together, or not to the recordings.
     """
 
     def __init__(
@@ -90,12 +172,12 @@ class Tuner:
         tuning: Mapping[str, Any],
         seed: int,
     ) -> None:
-        self.tuning, self._seed = tuning, seed
+        self.objective = Objective(training, tuning)
+        self._tuning, self._seed = tuning, seed
         self._period = rounded(float(np.median(np.diff(training[0].t))))
         # The estimator may have a model of its own, other than the plant's.
         own = {name: tuning[name] for name in ('order', 'phi')} | dict(estimator)
         self._noise, self._fixed = 0.0, own
-        self.objective = Objective(training, tuning)
         fuzzy = own.get('variant', SCHEME['variant']).startswith('fuzzy')
         kalman = fuzzy and not chosen_otherwise(own)
         if kalman:
@@ -140,11 +222,7 @@ class Tuner:
         """
         Return the parameters of the estimator at a point of the space.
 
-        Raises
-        ------
-        ConfigurationError
-            Values that are out of their bounds, or do not fit together.
-
+        Raises ConfigurationError for values that are out of bounds, or do not fit together.
         """
         changes = _changes(values)
         found = self._fixed | changes
@@ -178,7 +256,7 @@ class Tuner:
     ) -> Any:
         """Search as `minimise` does, or until `stopped` returns True after a trial."""
         samples = [recording.y.tobytes() for recording in self.objective.recordings]
-        problem = json.dumps([dict(self.tuning), self._fixed, self.space], sort_keys=True)
+        problem = json.dumps([dict(self._tuning), self._fixed, self.space], sort_keys=True)
         digest = hashlib.sha256(b''.join([problem.encode(), *samples])).hexdigest()[:16]
         with progress(total=trials, unit='trial', desc='tune', smoothing=0.05) as bar:
             return minimise(
