@@ -20,36 +20,24 @@ from scipy.optimize import least_squares
 from scipy.signal import butter, sosfiltfilt
 
 Floats = NDArray[np.float64]
-CUTOFF = 8.0
-"""Hz: both sides are low-passed alike; arms move slower."""
-QUICK = 40.0
-"""Hz: for the velocity by which friction changes its sign."""
-ROWS = 100.0
-"""Hz, at most: rows of the regression."""
-BLOCK, HELD_OUT = 2.0, 4
-"""Seconds of a block of the recording; one in so many is held out."""
+CUTOFF = 8.0  # Hz: both sides are low-passed alike; arms move slower
+QUICK = 40.0  # Hz: for the velocity by which friction changes its sign
+ROWS = 100.0  # Hz, at most: rows of the regression
+BLOCK, HELD_OUT = 2.0, 4  # s of a block of the recording; one in so many is held out
+# How strongly parameters are drawn to the URDF: what is held out says which of these is best.
 DRAWS = tuple(10.0**k for k in range(-4, 3))
-"""How strongly parameters are drawn to the URDF: what is held out says which of these is best."""
 HUBER, ROUNDS = 2.0, 6
-SHARE = 0.3
-"""Standard deviation of URDFs' masses and inertias, as a share of them."""
-LEAST_ROWS, SHORTEST = 200, 10.0
-"""Samples, and seconds, of the shortest recording."""
-LEVER = 0.1
-"""m: how far a link's centre may lie from where the URDF has it."""
-FARTHEST = 2.0
-"""m: how far the centre of a payload may lie from the last joint, each way."""
+SHARE = 0.3  # standard deviation of URDFs' masses and inertias, as a share of them
+LEAST_ROWS, SHORTEST = 200, 10.0  # samples, and seconds, of the shortest recording
+LEVER = 0.1  # m: how far a link's centre may lie from where the URDF has it
+FARTHEST = 2.0  # m: how far the centre of a payload may lie from the last joint, each way
+# Of the search for links that can exist; their least pseudo-inertia, as a share.
 SWEEPS, LEAST_SHARE = 500, 1e-3
-"""Of the search for links that can exist; their least pseudo-inertia, as a share."""
-STILL = 0.05
-"""rad/s: a joint that never moved faster has hardly moved."""
-ONE_WAY = 0.05
-"""Share of its moving time a joint has to move the other way, to tell friction from offset."""
+STILL = 0.05  # rad/s: a joint that never moved faster has hardly moved
+ONE_WAY = 0.05  # share of its moving time a joint has to move the other way, to tell its friction
+# A torque constant is told where the URDF's torque explains so much of the effort that friction
+# and rotor leave, and is no less than this share of the largest joint's.
 TOLD, WEAK = 0.7, 0.01
-"""
-A torque constant is told where the URDF's torque explains so much of the effort that friction and
-rotor leave, and is no less than this share of the largest joint's.
-"""
 
 
 class Identified(NamedTuple):
@@ -83,24 +71,11 @@ def identify(
     model: ArmModel, t: Floats, q: Floats, effort: Floats, *, torque_constants: ArrayLike = 1.0
 ) -> Identified:
     """
-    Find what the torque of an arm in free motion says about it.
+    Find what the torque of an arm in free motion says about it, beyond the URDF of `model`.
 
-    Parameters
-    ----------
-    model : ArmModel
-        By the URDF.
-    t : (K,) array
-        s, increasing.
-    q, effort : (K, n) array
-        Positions, and torques or currents.
-    torque_constants : number or (n,) array
-        Torque for a unit of effort; 0 where that is not known and has to be found.
-
-    Raises
-    ------
-    ConfigurationError
-        Too short a recording.
-
+    Takes increasing times t (K,) in s, positions q (K, n), efforts (K, n), and the torque for a
+    unit of effort, a number or (n,); 0 where that is not known and has to be found. Raises
+    ConfigurationError for a recording that is too short, or does not tell any such torque.
     """
     n = len(model.joints)
     problem = _Regression(model, t, q, effort, Calibration.of_urdf(model), torque_constants)
