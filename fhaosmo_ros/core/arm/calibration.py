@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 import yaml
 
 Floats = NDArray[np.float64]
-WIDTHS = (0.01, 0.03, 0.1, 0.3)
-"""rad/s: how fast friction changes its sign, tanh(velocity / width)."""
+WIDTHS = 0.01, 0.03, 0.1, 0.3  # rad/s: how fast friction changes its sign, tanh(velocity / width)
 
 
 @dataclass(frozen=True)
@@ -34,19 +33,16 @@ class Calibration:
     @classmethod
     def of_urdf(cls, model: ArmModel) -> 'Calibration':
         """Return that of an arm of which only the URDF is known."""
-        n = len(model.joints)
-        none = np.zeros(n)
+        none = np.zeros(len(model.joints))
+        dry = np.zeros((len(none), len(WIDTHS)))
         return cls(
-            model.joints, model.unloaded, none, none, none, np.zeros((n, len(WIDTHS))), np.ones(n),
-            none, none, none,
-        )  # fmt: skip
+            model.joints, model.unloaded, none, none, none, dry, none + 1.0, none, none, none
+        )
 
     def friction(self, velocity: Floats) -> Floats:
         """Return friction and offset at velocities (..., n), in N m."""
-        shares = np.tanh(velocity[..., np.newaxis] / np.array(WIDTHS))
-        return np.asarray(
-            self.offset + self.viscous * velocity + np.sum(self.coulomb * shares, axis=-1)
-        )
+        dry = np.sum(self.coulomb * np.tanh(velocity[..., np.newaxis] / WIDTHS), axis=-1)
+        return np.asarray(self.offset + self.viscous * velocity + dry)
 
     def dumps(self) -> str:
         """Return the text of the file."""
