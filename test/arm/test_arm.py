@@ -11,8 +11,7 @@ pytest.importorskip('pinocchio')
 
 from fhaosmo_ros.core.arm.arm import Arm
 from fhaosmo_ros.core.arm.bank import Bank
-from fhaosmo_ros.core.arm.calibration import Calibration
-from fhaosmo_ros.core.arm.model import ArmModel
+from fhaosmo_ros.core.arm.model import ArmModel, Calibration
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from observer_cases import discrete
 from robots import JOINTS, motion, segment, URDF

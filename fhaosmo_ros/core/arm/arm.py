@@ -8,17 +8,15 @@ from threading import RLock
 from typing import Any, NamedTuple, NoReturn
 
 from fhaosmo_ros.core.arm.bank import Bank
-from fhaosmo_ros.core.arm.calibration import Calibration
 from fhaosmo_ros.core.arm.doubts import Doubts
-from fhaosmo_ros.core.arm.model import ArmModel
+from fhaosmo_ros.core.arm.model import ArmModel, Calibration, Floats
 from fhaosmo_ros.core.arm.samples import Samples
 from fhaosmo_ros.core.parameters.arm import ARM_PARAMETERS
 from fhaosmo_ros.core.parameters.declaration import Parameters
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Floats = NDArray[np.float64]
 RATES = 0.15, 7.0, 30.0  # 1/s, at which contact begins and ends, and its intensity changes
 ONSET = 0.05  # s of a contact's intensity by which its force may be there at once
 SINCE = 0.005  # s for which positions do not show a contact that has begun; velocities do at once
@@ -52,8 +50,8 @@ class ArmEstimate(NamedTuple):
     covariance: Floats  # (n, n) of external_torque
     log_odds: Any  # float, natural logarithm of the odds of contact
     contact: Any  # bool
-    # str, the likeliest one by the samples of the contact, mostly of the last quarter of a second;
-    # also at the first one after it, else empty.
+    # str, likeliest by the samples of the contact, mostly of the last quarter of a second; also at
+    # the first sample after it, else empty.
     link: Any
 
     @property
@@ -110,13 +108,12 @@ class Arm:
         self.joints, n = model.joints, len(model.joints)
         if calibration is None and p['calibration_file']:
             calibration = Calibration.loads(text_of(p, 'calibration_file', 'a YAML file'))
-        self._calibrated = calibration is not None
-        self._alone = RLock()  # a second thread waits
+        self._calibrated, self._alone = calibration is not None, RLock()  # a second thread waits
         known = self.calibration = calibration or Calibration.of_urdf(model)
         if known.joints != model.joints:
+            expected, got = ', '.join(model.joints), ', '.join(known.joints)
             raise ConfigurationError(
-                f'calibration: expected the joints {", ".join(model.joints)} in this order, got '
-                f'{", ".join(known.joints)}'
+                f'calibration: expected the joints {expected} in this order, got {got}'
             )
         model.set_inertial(known.inertial, known.motor_inertia)
         self.adopt(p)
@@ -261,12 +258,11 @@ class Arm:
         """Go on to a sample at q, `h` seconds after the one before; `velocity` is measured."""
         bank, samples, before = self._bank, self._samples, self._velocity
         speed = way / h if self._of_position else velocity
-        if before is None or not self._of_position:
-            self._sliding = known = speed
-        else:
-            known = before
-            if self._calibrated:
-                self._sliding = self._sliding - np.expm1(-h / SLIDING) * (speed - self._sliding)
+        known = speed if before is None or not self._of_position else before
+        if known is speed:
+            self._sliding = speed
+        elif self._calibrated:
+            self._sliding = self._sliding - np.expm1(-h / SLIDING) * (speed - self._sliding)
         mass, coriolis, gravity = self.model.terms(q, known)
         less = [self._tare]
         if self._with_gravity:
@@ -280,8 +276,7 @@ class Arm:
             wide = samples.variance[1] / (h * h) if self._of_position else samples.variance[2]
             spread = (mass * (2.0 * wide)) @ mass.T
             bank.start(mass, drive, mass @ speed, spread, self._model_variance)
-        change = way if self._of_position else velocity
-        bank.step(h, mass, change, samples.vague, drive, self._reach)
+        bank.step(h, mass, way if self._of_position else speed, samples.vague, drive, self._reach)
         self.doubts.take(h, q, samples.torque, bank.mean[2])
         if self.doubts.text and not self.doubts.payload:
             self.problem = 'doubted'
@@ -321,11 +316,7 @@ class Arm:
         """
         Estimate from arrays: t (K,) in s, q, effort and velocity (K, n).
 
-        Raises
-        ------
-        ConfigurationError
-            Arrays of other sizes.
-
+        Raises ConfigurationError for arrays of other sizes.
         """
         stamps = np.round(np.asarray(t, dtype=np.float64) * 1e9).astype(np.int64)
         shape = len(stamps), len(self.joints)
@@ -346,18 +337,14 @@ class Arm:
         """
         Return the wrench at the origin of a frame that would make the estimated torque.
 
-        Damped least squares, weighted by the covariance of the torque.
+        Damped least squares, weighted by the covariance of the torque. Raises ConfigurationError
+        for an unknown frame.
 
         Returns
         -------
         (6,) array, bool
             Force in N and torque in N m along the frame's axes; True if part of them cannot be
             seen in this posture.
-
-        Raises
-        ------
-        ConfigurationError
-            An unknown frame.
 
         """
         jacobian = self.model.frame_jacobian(estimate.position, frame)

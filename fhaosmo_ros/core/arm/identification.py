@@ -10,8 +10,7 @@ URDF, so that what the motion does not show stays as it is.
 
 from typing import NamedTuple
 
-from fhaosmo_ros.core.arm.calibration import Calibration, WIDTHS
-from fhaosmo_ros.core.arm.model import ArmModel
+from fhaosmo_ros.core.arm.model import ArmModel, Calibration, Floats, WIDTHS
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,7 +18,6 @@ from scipy.linalg import block_diag
 from scipy.optimize import least_squares
 from scipy.signal import butter, sosfiltfilt
 
-Floats = NDArray[np.float64]
 CUTOFF = 8.0  # Hz: both sides are low-passed alike; arms move slower
 QUICK = 40.0  # Hz: for the velocity by which friction changes its sign
 ROWS = 100.0  # Hz, at most: rows of the regression
