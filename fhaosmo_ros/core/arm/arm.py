@@ -224,7 +224,8 @@ class Arm:
             self.problem = '' if problem == 'first' else problem
             if not problem:
                 go_on = self._go_on_late if self._delay else self._go_on
-                found = go_on(stamp, samples.position, samples.h, samples.way, samples.velocity)
+                place = samples.position.copy()  # the next sample is written over it
+                found = go_on(stamp, place, samples.h, samples.way, samples.velocity)
             if self.problem in ANEW:
                 self._forget()
             if self.problem or found is not None:
@@ -257,12 +258,13 @@ class Arm:
     ) -> ArmEstimate | None:
         """Go on to a sample at q, `h` seconds after the one before; `velocity` is measured."""
         bank, samples, before = self._bank, self._samples, self._velocity
-        speed = way / h if self._of_position else velocity
-        known = speed if before is None or not self._of_position else before
-        if known is speed:
-            self._sliding = speed
-        elif self._calibrated:
-            self._sliding = self._sliding - np.expm1(-h / SLIDING) * (speed - self._sliding)
+        if before is None or not self._of_position:
+            known = self._sliding = way / h if self._of_position else velocity
+        else:
+            known = before
+            if self._calibrated:
+                news = way / h - self._sliding
+                self._sliding = self._sliding - np.expm1(-h / SLIDING) * news
         mass, coriolis, gravity = self.model.terms(q, known)
         less = [self._tare]
         if self._with_gravity:
@@ -275,8 +277,9 @@ class Arm:
         if before is None:
             wide = samples.variance[1] / (h * h) if self._of_position else samples.variance[2]
             spread = (mass * (2.0 * wide)) @ mass.T
-            bank.start(mass, drive, mass @ speed, spread, self._model_variance)
-        bank.step(h, mass, way if self._of_position else speed, samples.vague, drive, self._reach)
+            bank.start(mass, drive, mass @ known, spread, self._model_variance)
+        change = way if self._of_position else velocity
+        bank.step(h, mass, change, samples.vague, drive, self._reach)
         self.doubts.take(h, q, samples.torque, bank.mean[2])
         if self.doubts.text and not self.doubts.payload:
             self.problem = 'doubted'

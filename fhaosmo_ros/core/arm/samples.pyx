@@ -133,8 +133,8 @@ cdef class Samples:
     """
 
     cdef readonly double h, vague  # time in which the joints moved (s), and share not known of it
-    cdef readonly object way  # (n,) that the joints moved; written anew by the next sample
-    cdef readonly object torque, position, velocity  # (n,), of the latest sample
+    # Of the latest sample, (n,), and how far the joints moved: written anew by the next one.
+    cdef readonly object torque, position, velocity, way
     cdef readonly object variance  # (3, n) of the noise of samples
     cdef Clock clock
     cdef double[:, ::1] now, found, least, most, lowest, highest
@@ -157,6 +157,8 @@ cdef class Samples:
         self.turning = np.array(turning, dtype=np.uint8)
         self.of_position, self.step = of_position, STEP * noise[0][1]
         self.rest, self.before, self.way = np.zeros((3, n))
+        self.now = sample = np.zeros((3, n))
+        self.torque, self.position, self.velocity = sample
         self.moved = self.way
         self.count, self.newest = FIRST_LEARNT, -(1 << 62)
         self.reset()
@@ -189,23 +191,26 @@ cdef class Samples:
         first; and the first one itself, 'first', 'clock set back' or 'restarts' (after a gap).
         """
         cdef const double[::1] likely = self.rest if known is None else known
+        cdef const double[:] e, q, v
         cdef int i, k, n = self.step.shape[0]
         cdef double over  # what divides `motion` to have p
         cdef bint moves = False, repeated = False, back
         if not n == likely.shape[0] == motion.shape[0]:
             raise ValueError(f'expected arrays of {n} joints')
         try:
-            sample = np.array((effort, position, velocity), dtype=np.float64)
-        except (TypeError, ValueError):
+            e, q, v = effort, position, velocity
+        except (TypeError, ValueError):  # no arrays of doubles, as library users may have them
+            try:
+                e, q, v = np.array((effort, position, velocity), dtype=np.float64)
+            except (TypeError, ValueError):
+                return 'wrong size'
+        if not n == e.shape[0] == q.shape[0] == v.shape[0]:
             return 'wrong size'
-        if sample.shape != (3, n):
-            return 'wrong size'
-        self.now, (self.torque, self.position, self.velocity) = sample, sample
         for k in range(n):
-            self.now[0, k] *= self.constants[k]
+            self.now[0, k], self.now[1, k], self.now[2, k] = self.constants[k] * e[k], q[k], v[k]
         for i in range(3):
             if not self.is_possible(i, self.now[i]):
-                return FAULTS[i] if np.isfinite(sample).all() else 'not finite'
+                return FAULTS[i] if np.isfinite(self.now).all() else 'not finite'
         back = time < self.newest - MAX_GAP * 1e9
         if time <= self.newest and not back:
             return 'not newer'
