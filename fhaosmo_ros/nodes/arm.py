@@ -219,9 +219,7 @@ class ArmNode(BaseNode):
             self._arm.adopt(values)
         endpoints.set_period(self._diagnostics, values['diagnostics_period'])
 
-    def _serve(
-        self, name: str, _: Trigger.Request, response: Trigger.Response
-    ) -> Trigger.Response:
+    def _serve(self, name: str, _: Any, response: Trigger.Response) -> Trigger.Response:
         response.success = self._estimate is not None
         response.message = SERVICES[name] if response.success else 'there is no estimate yet'
         if response.success:

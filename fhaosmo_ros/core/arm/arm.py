@@ -111,10 +111,9 @@ class Arm:
         self._calibrated, self._alone = calibration is not None, RLock()  # a second thread waits
         known = self.calibration = calibration or Calibration.of_urdf(model)
         if known.joints != model.joints:
-            expected, got = ', '.join(model.joints), ', '.join(known.joints)
-            raise ConfigurationError(
-                f'calibration: expected the joints {expected} in this order, got {got}'
-            )
+            own, got = ', '.join(model.joints), ', '.join(known.joints)
+            text = f'calibration: expected the joints {own} in this order, got {got}'
+            raise ConfigurationError(text)
         model.set_inertial(known.inertial, known.motor_inertia)
         self.adopt(p)
         self._of_position = p['measurement'] == 'position'
@@ -374,6 +373,5 @@ def text_of(parameters: Parameters, name: str, expected: str) -> str:
     try:
         return Path(path).expanduser().read_text(encoding='utf-8')
     except (OSError, UnicodeDecodeError) as error:
-        raise ConfigurationError(
-            f"parameter '{name}': expected {expected}, got {path} ({error})"
-        ) from None
+        text = f"parameter '{name}': expected {expected}, got {path} ({error})"
+        raise ConfigurationError(text) from None

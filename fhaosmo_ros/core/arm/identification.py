@@ -126,7 +126,8 @@ def payload_of_motion(
     Everything else is taken from `calibration`, of the arm without payload.
     """
     problem = _Regression(model, t, q, effort, calibration, calibration.torque_constants)
-    columns = problem.columns[..., : 10 * len(model.joints)][..., -10:]
+    last = 10 * (len(model.joints) - 1)
+    columns = problem.columns[..., last : last + 10]
 
     def missed(payload: Floats) -> Floats:
         return np.asarray(problem.unexplained - columns @ model.inertial_of(payload))

@@ -79,9 +79,8 @@ class ArmModel:
             mimics = [j.get('name') for j in ElementTree.fromstring(urdf).iterfind('joint[mimic]')]
             whole = pin.buildModelFromXML(urdf)
         except (ElementTree.ParseError, ValueError) as error:
-            raise ConfigurationError(
-                f'robot description: expected a URDF, got {urdf[:40]!r} ({error})'
-            ) from None
+            text = f'robot description: expected a URDF, got {urdf[:40]!r} ({error})'
+            raise ConfigurationError(text) from None
         moving = dict(zip(list(whole.names)[1:], list(whole.joints)[1:], strict=True))
         chosen = list(joints) or [
             name for name in moving
@@ -275,17 +274,14 @@ class Calibration:
             arrays = {name: np.array(v, dtype=np.float64) for name, v in given.items()}
             found = cls(joints, **arrays)
         except (yaml.YAMLError, TypeError, KeyError, ValueError) as error:
-            why = ' '.join(str(error).split())
-            raise ConfigurationError(
-                f'calibration: expected a file of `calibrate`, got {text[:40]!r} ({why})'
-            ) from None
+            got = f'{text[:40]!r} ({" ".join(str(error).split())})'
+            problem = f'calibration: expected a file of `calibrate`, got {got}'
+            raise ConfigurationError(problem) from None
         n = len(joints)
         shapes = {'inertial': (n, 10), 'coulomb': (n, len(WIDTHS)), 'log_odds': ()}
         for name, array in arrays.items():
             shape = shapes.get(name, (n,))
             if array.shape != shape or not np.isfinite(array).all():
-                raise ConfigurationError(
-                    f'calibration: {name}: expected finite numbers of shape {shape}, got '
-                    f'{shown(array)}'
-                )
+                text = f'expected finite numbers of shape {shape}, got {shown(array)}'
+                raise ConfigurationError(f'calibration: {name}: {text}')
         return found
