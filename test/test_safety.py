@@ -14,7 +14,7 @@ import os
 import pickle
 
 from fhaosmo_ros.core import ConfigurationError, OnlineEstimator, Plant
-from fhaosmo_ros.core.arm.samples import Clock
+from fhaosmo_ros.core.arm.samples import Samples
 from fhaosmo_ros.core.model import phi
 from fhaosmo_ros.core.observer.kalman import LinearModel
 import numpy as np
@@ -142,7 +142,7 @@ def test_compiled_code_takes_no_arrays_of_other_sizes():
     smoother = running(KINDS['smoothed'], 300, 5).smoothing
     for call, *arguments in (
         (policy.run, STAMPS[:2], Y, none), (policy.run, STAMPS, Y, np.zeros((200, 2))),
-        (Plant()._system.advance, Y, Y), (Clock().interval, 1e-3, three, three[:2], three),
+        (Plant()._system.advance, Y, Y), (Samples, *[three] * 5, True),
         (smoother._passes.forward, three), (LinearModel, np.eye(18), 1.0),
         *((phi.Expressions, [[(int(code), 1)]], 1, 1) for code in (phi.ADD, phi.STATE)),
     ):  # fmt: skip

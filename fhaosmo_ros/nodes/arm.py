@@ -23,19 +23,15 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
-SILENT = 0.5
-"""Seconds without a sample that are reported."""
+SILENT = 0.5  # seconds without a sample that are reported
+KIND = 15  # first letters of a text that tell its kind: names and numbers follow, and may change
 FIELDS = {
     'external_torque': {'effort': 'external_torque'},
     'standard_deviation': {'effort': 'standard_deviation'},
     'joint_states': {'position': 'position', 'velocity': 'velocity'},
 }
 """What the fields of a JointState are in `ArmEstimate`."""
-TOPICS = dict.fromkeys(FIELDS, JointState) | {
-    'external_wrench': WrenchStamped, 'event': DiagnosticArray
-}  # fmt: skip
-KIND = 15
-"""So many first letters of a text tell its kind: names and numbers, which may change, follow."""
+OTHERS = {'external_wrench': WrenchStamped, 'event': DiagnosticArray}
 SERVICES = {
     'reset': 'the estimates begin anew with the next sample',
     'tare': 'the present external torque counts as zero',
@@ -69,7 +65,7 @@ class ArmNode(BaseNode):
     def __init__(self, given: Mapping[str, Any]) -> None:
         super().__init__('arm', given)
         values = self.values
-        endpoints.check_overrides(self, [f'~/{topic}' for topic in TOPICS])
+        endpoints.check_overrides(self, [f'~/{topic}' for topic in (*FIELDS, *OTHERS)])
         self._arm: Arm | None = None
         self._description = ''
         self._problems: dict[str, str] = {}  # of each kind the last one, since the last report
@@ -77,10 +73,12 @@ class ArmNode(BaseNode):
         self._published, self._latest = -np.inf, -np.inf
         self._contact: bool | None = False  # None: not known
         self._estimate: ArmEstimate | None = None
+        kinds = dict.fromkeys(FIELDS, JointState) | OTHERS
+        if not values['wrench_frame']:
+            del kinds['external_wrench']
         self._outputs = {
             topic: endpoints.create_publisher(self, kind, f'~/{topic}', latched=topic == 'event')
-            for topic, kind in TOPICS.items()
-            if topic != 'external_wrench' or values['wrench_frame']
+            for topic, kind in kinds.items()
         }
         self._listeners = endpoints.Listeners(self._outputs)
         if values['robot_description_file']:
@@ -102,7 +100,7 @@ class ArmNode(BaseNode):
             arm.model.frame_jacobian(np.zeros(len(arm.joints)), values['wrench_frame'])
         self._arm, self._description = arm, urdf
         self._messages = {topic: JointState(name=list(arm.joints)) for topic in FIELDS}
-        self._say_event(0, OK, 'no contact yet', {})
+        self._tell(OK, 'no contact yet')
         self.get_logger().info(
             f'estimating the external torques of {", ".join(arm.joints)} from '
             f'{self.resolve_topic_name(values["input_topic"])} '
@@ -135,17 +133,22 @@ class ArmNode(BaseNode):
             self._warn(f'{MEANT[arm.problem]}{anew} ({arm.counters[arm.problem]} so far)')
         if arm.doubts.text:
             self._warn(arm.doubts.text)
-        if estimate is not None:
-            self._latest, self._estimate = perf_counter(), estimate
-            self._tell(arm, estimate)
+        if estimate is None:
+            return
+        self._latest, self._estimate = perf_counter(), estimate
+        if estimate.contact != self._contact:
+            self._contact, at = estimate.contact, estimate.link
+            if self._contact:
+                self._tell(WARN, f'contact, most likely at {at}', estimate)
+            else:
+                at = at and f', most likely it was at {at}'
+                self._tell(OK, f'contact has ended{at}', estimate)
+        # Half a sample early rather than one late: rates that divide each other stay as they are.
+        if not 0.0 <= stamp - self._published < 0.9e9 / self.values['publish_rate']:
+            self._published = stamp
             self._publish(arm, estimate)
 
     def _publish(self, arm: Arm, estimate: ArmEstimate) -> None:
-        period = 1e9 / self.values['publish_rate']
-        # Half a sample early rather than one late: rates that divide each other stay as they are.
-        if 0.0 <= estimate.stamp - self._published < 0.9 * period:
-            return
-        self._published = estimate.stamp
         stamp, heard = time_message(estimate.stamp), self._listeners.heard()
         for topic, message in self._messages.items():
             if topic in heard:
@@ -164,28 +167,18 @@ class ArmNode(BaseNode):
             )
             publisher.publish(message)
 
-    def _tell(self, arm: Arm, estimate: ArmEstimate) -> None:
-        """Publish that a contact has begun or ended."""
-        if estimate.contact == self._contact:
-            return
-        self._contact = estimate.contact
-        at, values = estimate.link, {'link': estimate.link, 'log odds': estimate.log_odds}
-        for name, torque in zip(arm.joints, estimate.external_torque, strict=True):
-            values[f'external torque {name}'] = torque
-        if estimate.contact:
-            text = f'contact, most likely at {at}'
-            self.get_logger().warning(f'event: {text}', throttle_duration_sec=QUIET)
-        else:
-            text = f'contact has ended{at and f", most likely it was at {at}"}'
-        self._say_event(estimate.stamp, WARN if estimate.contact else OK, text, values)
-
-    def _say_event(self, stamp: int, level: bytes, text: str, values: dict[str, Any]) -> None:
-        report = diagnostics.Report('contact')
+    def _tell(self, level: bytes, text: str, estimate: ArmEstimate | None = None) -> None:
+        """Publish what is known of contact, by an estimate if there is one."""
+        report, when = diagnostics.Report('contact'), self.get_clock().now().to_msg()
         report.find(level, text)
-        report.values = values
-        when = time_message(stamp) if stamp else self.get_clock().now().to_msg()
-        message = diagnostics.array_of(self, when, [report])
-        self._outputs['event'].publish(message)
+        if estimate is not None:
+            when = time_message(estimate.stamp)
+            report.values = {'link': estimate.link, 'log odds': estimate.log_odds}
+            torques = zip(self._arm.joints, estimate.external_torque, strict=True)
+            report.values |= {f'external torque {name}': torque for name, torque in torques}
+        if level == WARN:
+            self.get_logger().warning(f'event: {text}', throttle_duration_sec=QUIET)
+        self._outputs['event'].publish(diagnostics.array_of(self, when, [report]))
 
     def _warn(self, text: str) -> None:
         """Log a problem, each kind at most every `QUIET` seconds, and report it."""
@@ -210,7 +203,7 @@ class ArmNode(BaseNode):
             report.find(ERROR, f'no usable sample on {topic} {since}: nothing is published')
             if self._contact:
                 self._contact = None
-                self._say_event(0, STALE, f'no usable sample {since}: contact is not known', {})
+                self._tell(STALE, f'no usable sample {since}: contact is not known')
         report.values |= {f'samples {what}': n for what, n in self._arm.counters.items()}
         if self._estimate is not None:
             report.values['log odds of contact'] = self._estimate.log_odds
@@ -226,9 +219,7 @@ class ArmNode(BaseNode):
             self._arm.adopt(values)
         endpoints.set_period(self._diagnostics, values['diagnostics_period'])
 
-    def _serve(
-        self, name: str, _: Trigger.Request, response: Trigger.Response
-    ) -> Trigger.Response:
+    def _serve(self, name: str, _: Any, response: Trigger.Response) -> Trigger.Response:
         response.success = self._estimate is not None
         response.message = SERVICES[name] if response.success else 'there is no estimate yet'
         if response.success:

@@ -11,8 +11,7 @@ pytest.importorskip('pinocchio')
 
 from fhaosmo_ros.core.arm.arm import Arm
 from fhaosmo_ros.core.arm.bank import Bank
-from fhaosmo_ros.core.arm.calibration import Calibration
-from fhaosmo_ros.core.arm.model import ArmModel
+from fhaosmo_ros.core.arm.model import ArmModel, Calibration
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from observer_cases import discrete
 from robots import JOINTS, motion, segment, URDF
@@ -232,12 +231,12 @@ def test_noise_that_nobody_told_is_found_and_makes_no_contact(free):
     t, q, _, torque = free
     noise = np.array([0.02, 0.2, 0.1])
     assert not arm.run(t, q, torque + noise * random.standard_normal(q.shape)).contact[500:].any()
-    np.testing.assert_allclose(np.sqrt(arm._samples.noise.variance[0]), noise, rtol=0.15)
+    np.testing.assert_allclose(np.sqrt(arm._samples.variance[0]), noise, rtol=0.15)
     told = Arm(URDF, position_noise=[20.0 * NOISE], torque_noise=[0.5])
     shaken = q + 20.0 * NOISE * random.standard_normal(q.shape)
     found = Arm(URDF, torque_noise=[0.5]).run(t, shaken, torque)
     assert rms(found.external_torque) < 1.1 * rms(told.run(t, shaken, torque).external_torque)
-    np.testing.assert_array_equal(told._samples.noise.variance[0], 0.25)
+    np.testing.assert_array_equal(told._samples.variance[0], 0.25)
 
 
 def stamped(t, late):

@@ -7,9 +7,8 @@ import pytest
 pytest.importorskip('pinocchio')
 
 import bag_files as files
-from fhaosmo_ros.core.arm.calibration import Calibration
 from fhaosmo_ros.core.arm.identification import identify, noise_of, payload_of_motion
-from fhaosmo_ros.core.arm.model import ArmModel
+from fhaosmo_ros.core.arm.model import ArmModel, Calibration
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.tools.arm import calibrate, replay
 from fhaosmo_ros.topics import TEXT

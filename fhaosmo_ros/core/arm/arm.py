@@ -8,55 +8,35 @@ from threading import RLock
 from typing import Any, NamedTuple, NoReturn
 
 from fhaosmo_ros.core.arm.bank import Bank
-from fhaosmo_ros.core.arm.calibration import Calibration
 from fhaosmo_ros.core.arm.doubts import Doubts
-from fhaosmo_ros.core.arm.model import ArmModel
-from fhaosmo_ros.core.arm.samples import Noise, Samples
+from fhaosmo_ros.core.arm.model import ArmModel, Calibration, Floats
+from fhaosmo_ros.core.arm.samples import Samples
 from fhaosmo_ros.core.parameters.arm import ARM_PARAMETERS
 from fhaosmo_ros.core.parameters.declaration import Parameters
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Floats = NDArray[np.float64]
-RATES = 0.15, 7.0, 30.0
-"""Rates (1/s) at which contact begins and ends, and its intensity changes."""
-ONSET = 0.05
-"""Seconds of a contact's intensity by which its force may be there at once."""
-SINCE = 0.005
-"""Seconds for which positions do not show a contact that has begun; velocities do at once."""
-DECAY = 1.5
-"""Of d in free motion, 1/s: friction changes with the direction of motion."""
-INTENSITIES = (0.012, 0.044, 0.16, 0.6)
-"""Of contact forces, in the arm's weight over the root of a second."""
+RATES = 0.15, 7.0, 30.0  # 1/s, at which contact begins and ends, and its intensity changes
+ONSET = 0.05  # s of a contact's intensity by which its force may be there at once
+SINCE = 0.005  # s for which positions do not show a contact that has begun; velocities do at once
+DECAY = 1.5  # 1/s, of d in free motion: friction changes with the direction of motion
+INTENSITIES = 0.012, 0.044, 0.16, 0.6  # of contact forces: arm's weight / root of a second
+# Shares of the torque of the arm's weight, which counts at least so much of the largest.
 TORQUE_NOISE, MODEL_ERROR, LEAST = 0.015, 0.015, 0.05
-"""Shares of the torque of the arm's weight, which counts at least so much of the largest."""
-LEAST_FOUND = 0.1
-"""Share of that noise of torques below which none is found."""
-ODDS = 3.0
-"""Logarithm of the odds above which contact is reported, if calibration says nothing."""
-FURTHER = 0.5
-"""rad (m) beyond the URDF's limits, where positions are not believed."""
-FASTER = 3.0
-"""Times the URDF's velocity limit: a position that has moved so fast is not believed."""
-STEP = 12.0**0.5
-"""Of an encoder, in standard deviations of its error of rounding."""
-STRONGER = 100.0
-"""Times the URDF's effort limit, or the torque of the arm's weight: no torque of this arm."""
-STOPPING = 2.0
-"""Times the same, by which no arm is stopped between two samples."""
-DAMPING = 0.02
-"""Singular value of a frame's Jacobian, m, below which a force along it is damped."""
+LEAST_FOUND = 0.1  # share of that noise of torques below which none is found
+ODDS = 3.0  # their logarithm, above which contact is reported, if calibration says nothing
+FURTHER = 0.5  # rad (m) beyond the URDF's limits, where positions are not believed
+FASTER = 3.0  # times the URDF's velocity limit: a position that moved so fast is not believed
+STRONGER = 100.0  # times the URDF's effort limit, or torque of the weight: no torque of this arm
+STOPPING = 2.0  # times the same, by which no arm is stopped between two samples
+DAMPING = 0.02  # m, singular value of a frame's Jacobian below which a force along it is damped
+# s between two looks at the posture, and in contact at it and the link; and how much of what was
+# known of the link still counts at the next one, since a contact may slide.
 LOOK, LOOK_CLOSELY, KEEP = 0.05, 0.01, 0.96
-"""
-Seconds between two looks at the posture, and in contact at it and the link; and how much of what
-was known of the link still counts at the next one, since a contact may slide.
-"""
-ELSEWHERE = 0.02
-"""By so much forces on each link still count in a contact, however sure another link is."""
-SLIDING = 0.005
-"""s: memory of the differences of positions that friction is computed from."""
-ANEW = ('clock set back', 'restarts', 'jumped', 'diverged')
+ELSEWHERE = 0.02  # by so much forces on each link still count, however sure another link is
+SLIDING = 0.005  # s: memory of the differences of positions that friction is computed from
+ANEW = 'clock set back', 'restarts', 'jumped', 'diverged'
 """What makes the estimates begin anew."""
 
 
@@ -70,8 +50,8 @@ class ArmEstimate(NamedTuple):
     covariance: Floats  # (n, n) of external_torque
     log_odds: Any  # float, natural logarithm of the odds of contact
     contact: Any  # bool
-    # str, the likeliest one by the samples of the contact, mostly of the last quarter of a second;
-    # also at the first one after it, else empty.
+    # str, likeliest by the samples of the contact, mostly of the last quarter of a second; also at
+    # the first sample after it, else empty.
     link: Any
 
     @property
@@ -128,14 +108,12 @@ class Arm:
         self.joints, n = model.joints, len(model.joints)
         if calibration is None and p['calibration_file']:
             calibration = Calibration.loads(text_of(p, 'calibration_file', 'a YAML file'))
-        self._calibrated = calibration is not None
-        self._alone = RLock()  # a second thread waits
+        self._calibrated, self._alone = calibration is not None, RLock()  # a second thread waits
         known = self.calibration = calibration or Calibration.of_urdf(model)
         if known.joints != model.joints:
-            raise ConfigurationError(
-                f'calibration: expected the joints {", ".join(model.joints)} in this order, got '
-                f'{", ".join(known.joints)}'
-            )
+            own, got = ', '.join(model.joints), ', '.join(known.joints)
+            text = f'calibration: expected the joints {own} in this order, got {got}'
+            raise ConfigurationError(text)
         model.set_inertial(known.inertial, known.motor_inertia)
         self.adopt(p)
         self._of_position = p['measurement'] == 'position'
@@ -146,24 +124,24 @@ class Arm:
         scale = model.torque_of_weight()
         scale = np.maximum(scale, LEAST * np.max(scale))
         self._model_variance = self._size('model_error', MODEL_ERROR * scale) ** 2
-        told, position = self._size('torque_noise'), self._size('position_noise')
-        torque = np.where(told > 0.0, told, TORQUE_NOISE * scale)
+        told, speed = self._size('torque_noise'), self._values('velocity_noise')
+        # Of efforts, positions and velocities: at first, at least and at most.
+        first = np.array([TORQUE_NOISE * scale, self._size('position_noise'), speed])
+        noise = np.array([first, first, np.full_like(first, np.inf)])
+        noise[1, 0] *= LEAST_FOUND
+        noise[:, 0] = np.where(told > 0.0, told, noise[:, 0])
         strong = np.fmax(np.where(model.effort_limits < np.inf, model.effort_limits, 0.0), scale)
-        # Of efforts, positions and velocities.
-        size = np.array([torque, position, self._values('velocity_noise')])
-        least, most = size.copy(), np.full_like(size, np.inf)
-        least[0, told == 0.0] *= LEAST_FOUND
-        most[0, told > 0.0] = told[told > 0.0]
-        noise, fastest = Noise(size, least, most), FASTER * model.velocity_limits
-        self._variance = noise.variance[1 if self._of_position else 2]
+        fastest = FASTER * model.velocity_limits
+        limits = np.array([
+            [-STRONGER * strong, model.lowest - FURTHER, -fastest],
+            [STRONGER * strong, model.highest + FURTHER, fastest],
+        ])  # fmt: skip
         self._samples = Samples(
-            noise, constants, np.array([-STRONGER * strong, model.lowest - FURTHER, -fastest]),
-            np.array([STRONGER * strong, model.highest + FURTHER, fastest]), STEP * position,
-            STOPPING * strong, model.continuous, self._of_position,
-        )  # fmt: skip
+            noise, limits, constants, STOPPING * strong, model.continuous, self._of_position
+        )
         self._bank = Bank(
-            2.0 * DECAY * self._model_variance, DECAY, np.array(INTENSITIES) * model.weight,
-            RATES, noise.variance, ONSET, SINCE if self._of_position else 0.0, self._of_position,
+            2.0 * DECAY * self._model_variance, DECAY, np.array(INTENSITIES) * model.weight, RATES,
+            self._samples.variance, ONSET, SINCE if self._of_position else 0.0, self._of_position,
         )  # fmt: skip
         self._rest, self._tare = np.zeros((2, n))
         self.counters: Counter[str] = Counter()
@@ -192,9 +170,10 @@ class Arm:
             self._forget()
 
     def _forget(self) -> None:
-        # Times, positions, and those summed up beside velocities, until their effort has come.
+        # Times, positions, and how far the joints have moved beside velocities: what waits for its
+        # effort. Then time and way of the latest effort.
         self._kept: deque[tuple[float, Floats, Floats]] = deque()
-        self._then = np.nan, self._rest  # when the latest effort was, and where
+        self._then = np.nan, self._rest
         self._velocity: Floats | None = None  # estimated
         self._contact = False
         self._looked, self._evidence = 0, self._rest  # stamp, and log-likelihood of each link
@@ -238,57 +217,53 @@ class Arm:
 
         """
         with self._alone:
-            self.problem = ''
-            samples = self._samples
+            samples, found = self._samples, None
             speed = self._rest if self._of_position else velocity
             problem = samples.take(stamp, effort, q, speed, self._velocity, self._bank.motion)
-            if problem:
-                return self._refuse(problem)
-            if self._delay:
-                return self._go_on_late(stamp)
-            return self._go_on(stamp, samples.position, samples.h, samples.change, samples.speed)
+            self.problem = '' if problem == 'first' else problem
+            if not problem:
+                go_on = self._go_on_late if self._delay else self._go_on
+                place = samples.position.copy()  # the next sample is written over it
+                found = go_on(stamp, place, samples.h, samples.way, samples.velocity)
+            if self.problem in ANEW:
+                self._forget()
+            if self.problem or found is not None:
+                self.counters[self.problem or 'used'] += 1
+            return found
 
-    def _refuse(self, problem: str) -> ArmEstimate | None:
-        """Count a sample that is not used, and begin anew where that has to be."""
-        if problem in ANEW:
-            self._forget()
-        if problem != 'first':
-            self.problem = problem
-            self.counters[problem] += 1
-        return None
-
-    def _go_on_late(self, stamp: int) -> ArmEstimate | None:
+    def _go_on_late(
+        self, stamp: int, q: Floats, h: float, way: Floats, velocity: Floats
+    ) -> ArmEstimate | None:
         """Go on to the time when the effort was measured, between two samples before."""
-        samples, kept = self._samples, self._kept
-        time, _, (way, _) = kept[-1] if kept else (0.0, None, (self._rest, None))
-        moved = np.array([way + samples.way, samples.velocity])
-        kept.append((time + samples.h, samples.position.copy(), moved))
+        kept = self._kept
+        time, _, (before, _) = kept[-1] if kept else (0.0, q, (0.0, velocity))
+        kept.append((time + h, q, np.array([before + way, velocity])))
         then = kept[-1][0] - self._delay
         while len(kept) > 2 and kept[1][0] <= then:
             kept.popleft()
         if len(kept) < 2 or kept[0][0] > then:
             return None
-        (t0, _, before), (t1, q, after) = kept[0], kept[1]
-        back = (t1 - then) / (t1 - t0) * (after - before)
-        way, velocity = after - back
-        h, moved, self._then = then - self._then[0], way - self._then[1], (then, way)
-        speed = moved / h if self._of_position else velocity
+        (t0, _, first), (t1, q, second) = kept[0], kept[1]
+        back = (t1 - then) / (t1 - t0) * (second - first)
+        way, velocity = second - back
+        h, moved = then - self._then[0], way - self._then[1]
+        self._then = then, way
         if np.isnan(h):
             return None
-        change = moved if self._of_position else speed
-        stamp -= round(1e9 * self._delay)
-        return self._go_on(stamp, q - back[0], h, change, speed)
+        return self._go_on(stamp - round(1e9 * self._delay), q - back[0], h, moved, velocity)
 
     def _go_on(
-        self, stamp: int, q: Floats, h: float, change: Floats, speed: Floats
+        self, stamp: int, q: Floats, h: float, way: Floats, velocity: Floats
     ) -> ArmEstimate | None:
-        """Go on to a sample; how the joints have moved within `h` seconds is as of `Samples`."""
+        """Go on to a sample at q, `h` seconds after the one before; `velocity` is measured."""
         bank, samples, before = self._bank, self._samples, self._velocity
         if before is None or not self._of_position:
-            self._sliding = speed.copy()
-        elif self._calibrated:
-            self._sliding = self._sliding - np.expm1(-h / SLIDING) * (speed - self._sliding)
-        known = self._sliding if before is None or not self._of_position else before
+            known = self._sliding = way / h if self._of_position else velocity
+        else:
+            known = before
+            if self._calibrated:
+                news = way / h - self._sliding
+                self._sliding = self._sliding - np.expm1(-h / SLIDING) * news
         mass, coriolis, gravity = self.model.terms(q, known)
         less = [self._tare]
         if self._with_gravity:
@@ -299,19 +274,21 @@ class Arm:
             less.append(self.calibration.friction(self._sliding))
         drive = bank.net_torque(samples.torque, known, coriolis, less)
         if before is None:
-            wide = 2.0 * self._variance / (h * h if self._of_position else 1.0)
-            spread = (mass * wide) @ mass.T
-            bank.start(mass, drive, mass @ speed, spread, self._model_variance)
+            wide = samples.variance[1] / (h * h) if self._of_position else samples.variance[2]
+            spread = (mass * (2.0 * wide)) @ mass.T
+            bank.start(mass, drive, mass @ known, spread, self._model_variance)
+        change = way if self._of_position else velocity
         bank.step(h, mass, change, samples.vague, drive, self._reach)
         self.doubts.take(h, q, samples.torque, bank.mean[2])
         if self.doubts.text and not self.doubts.payload:
-            return self._refuse('doubted')
-        self._velocity = speed = self.model.velocity_of(bank.mean[1])
-        if not samples.is_possible(2, speed):  # C^T qd grows with its square
+            self.problem = 'doubted'
+            return None
+        self._velocity = self.model.velocity_of(bank.mean[1])
+        if not samples.is_possible(2, self._velocity):  # C^T qd grows with its square
             samples.reset()
-            return self._refuse('diverged')
-        self.counters['used'] += 1
-        return self._estimate(stamp, q, speed)
+            self.problem = 'diverged'
+            return None
+        return self._estimate(stamp, q, self._velocity)
 
     def _estimate(self, stamp: int, q: Floats, velocity: Floats) -> ArmEstimate:
         """Return what the bank says, and the likeliest link by all that it said in a contact."""
@@ -333,7 +310,6 @@ class Arm:
                 shares = likely / np.sum(likely) + ELSEWHERE
             self._reach = np.asarray(shares @ reach.reshape(len(q), -1)).reshape(len(q), len(q))
         link = self.model.links[int(np.argmax(self._evidence))] if self._contact or touched else ''
-        q = q.copy()  # the sample is written anew by the next one
         return ArmEstimate(stamp, q, velocity, torques, covariance, odds, self._contact, link)
 
     def run(
@@ -342,11 +318,7 @@ class Arm:
         """
         Estimate from arrays: t (K,) in s, q, effort and velocity (K, n).
 
-        Raises
-        ------
-        ConfigurationError
-            Arrays of other sizes.
-
+        Raises ConfigurationError for arrays of other sizes.
         """
         stamps = np.round(np.asarray(t, dtype=np.float64) * 1e9).astype(np.int64)
         shape = len(stamps), len(self.joints)
@@ -367,18 +339,14 @@ class Arm:
         """
         Return the wrench at the origin of a frame that would make the estimated torque.
 
-        Damped least squares, weighted by the covariance of the torque.
+        Damped least squares, weighted by the covariance of the torque. Raises ConfigurationError
+        for an unknown frame.
 
         Returns
         -------
         (6,) array, bool
             Force in N and torque in N m along the frame's axes; True if part of them cannot be
             seen in this posture.
-
-        Raises
-        ------
-        ConfigurationError
-            An unknown frame.
 
         """
         jacobian = self.model.frame_jacobian(estimate.position, frame)
@@ -405,6 +373,5 @@ def text_of(parameters: Parameters, name: str, expected: str) -> str:
     try:
         return Path(path).expanduser().read_text(encoding='utf-8')
     except (OSError, UnicodeDecodeError) as error:
-        raise ConfigurationError(
-            f"parameter '{name}': expected {expected}, got {path} ({error})"
-        ) from None
+        text = f"parameter '{name}': expected {expected}, got {path} ({error})"
+        raise ConfigurationError(text) from None

@@ -10,27 +10,22 @@ from typing import Any
 from fhaosmo_ros.core.arm.model import ArmModel, Floats
 import numpy as np
 
-EVERY = 0.1
-"""Seconds between two rows."""
-MEMORY = 20.0
-"""Seconds after which a row counts 1/e."""
-LEAST = 5.0
-"""Seconds of motion that are looked at before anything is said."""
-EXPLAINED = 0.9
-"""Share of the squared torque that a mistake has to explain."""
-LARGE = 4.0
-"""Times the model's error from which on a torque is worth explaining."""
-MOVED = 0.1
-"""rad (m): standard deviation of a posture in which a push may look like anything."""
-SEEN = (1e-3, 1e-5)
-"""Least shares of the excitation at which a direction of gravity, and a payload, can be told."""
+EVERY = 0.1  # s between two rows
+MEMORY = 20.0  # s after which a row counts 1/e
+LEAST = 5.0  # s of motion that are looked at before anything is said
+EXPLAINED = 0.9  # share of the squared torque that a mistake has to explain
+LARGE = 4.0  # times the model's error from which on a torque is worth explaining
+MOVED = 0.1  # rad (m), standard deviation of a posture in which a push may look like anything
+# Least shares of the excitation at which a direction of gravity, and a payload, can be told.
+SEEN = 1e-3, 1e-5
 
 
 class Doubts:
     """
     Looks for mistakes in what the external torques of an arm have in common.
 
-    `with_gravity`: torques are said to contain it. `error` (n,): of the model, N m.
+    `with_gravity`: torques are said to contain it. `error` (n,): of the model, N m. `text` says
+    what is found, and `payload` whether that is a payload.
     """
 
     def __init__(self, model: ArmModel, with_gravity: bool, error: Floats) -> None:
@@ -88,17 +83,15 @@ class Doubts:
                 text = ', '.join(f'{x:.2f}' for x in gravity)
                 return f"gravity is as if it were [{text}] in the base's frame: parameter gravity"
         slopes = both / np.maximum(own, 1e-12)
-        wrong = (
-            (np.abs(slopes + 2.0) < 0.5) & (squares > LARGE**2 * count)
-            & (both * slopes / self._error**2 > EXPLAINED * squares)
-        )  # fmt: skip
+        reverses = (np.abs(slopes + 2.0) < 0.5) & (squares > LARGE**2 * count)
+        wrong = reverses & (both * slopes / self._error**2 > EXPLAINED * squares)
         if wrong.any():
             names = ', '.join(np.array(self._model.joints)[wrong])
             return f'the effort of {names} has the wrong sign'
         payload = fit(slice(3, 7), SEEN[1])
-        self.payload = payload is not None and payload[0] > 0.0
-        if payload is None or not self.payload:
+        if payload is None or payload[0] <= 0.0:
             return ''
+        self.payload = True
         numbers = ', '.join(f'{x:.3g}' for x in (payload[0], *(payload[1:] / payload[0])))
         return (
             f'the external torque is that of {payload[0]:.3g} kg more at the last link: if it '

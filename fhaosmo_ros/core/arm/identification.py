@@ -10,8 +10,7 @@ URDF, so that what the motion does not show stays as it is.
 
 from typing import NamedTuple
 
-from fhaosmo_ros.core.arm.calibration import Calibration, WIDTHS
-from fhaosmo_ros.core.arm.model import ArmModel
+from fhaosmo_ros.core.arm.model import ArmModel, Calibration, Floats, WIDTHS
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,37 +18,24 @@ from scipy.linalg import block_diag
 from scipy.optimize import least_squares
 from scipy.signal import butter, sosfiltfilt
 
-Floats = NDArray[np.float64]
-CUTOFF = 8.0
-"""Hz: both sides are low-passed alike; arms move slower."""
-QUICK = 40.0
-"""Hz: for the velocity by which friction changes its sign."""
-ROWS = 100.0
-"""Hz, at most: rows of the regression."""
-BLOCK, HELD_OUT = 2.0, 4
-"""Seconds of a block of the recording; one in so many is held out."""
+CUTOFF = 8.0  # Hz: both sides are low-passed alike; arms move slower
+QUICK = 40.0  # Hz: for the velocity by which friction changes its sign
+ROWS = 100.0  # Hz, at most: rows of the regression
+BLOCK, HELD_OUT = 2.0, 4  # s of a block of the recording; one in so many is held out
+# How strongly parameters are drawn to the URDF: what is held out says which of these is best.
 DRAWS = tuple(10.0**k for k in range(-4, 3))
-"""How strongly parameters are drawn to the URDF: what is held out says which of these is best."""
 HUBER, ROUNDS = 2.0, 6
-SHARE = 0.3
-"""Standard deviation of URDFs' masses and inertias, as a share of them."""
-LEAST_ROWS, SHORTEST = 200, 10.0
-"""Samples, and seconds, of the shortest recording."""
-LEVER = 0.1
-"""m: how far a link's centre may lie from where the URDF has it."""
-FARTHEST = 2.0
-"""m: how far the centre of a payload may lie from the last joint, each way."""
+SHARE = 0.3  # standard deviation of URDFs' masses and inertias, as a share of them
+LEAST_ROWS, SHORTEST = 200, 10.0  # samples, and seconds, of the shortest recording
+LEVER = 0.1  # m: how far a link's centre may lie from where the URDF has it
+FARTHEST = 2.0  # m: how far the centre of a payload may lie from the last joint, each way
+# Of the search for links that can exist; their least pseudo-inertia, as a share.
 SWEEPS, LEAST_SHARE = 500, 1e-3
-"""Of the search for links that can exist; their least pseudo-inertia, as a share."""
-STILL = 0.05
-"""rad/s: a joint that never moved faster has hardly moved."""
-ONE_WAY = 0.05
-"""Share of its moving time a joint has to move the other way, to tell friction from offset."""
+STILL = 0.05  # rad/s: a joint that never moved faster has hardly moved
+ONE_WAY = 0.05  # share of its moving time a joint has to move the other way, to tell its friction
+# A torque constant is told where the URDF's torque explains so much of the effort that friction
+# and rotor leave, and is no less than this share of the largest joint's.
 TOLD, WEAK = 0.7, 0.01
-"""
-A torque constant is told where the URDF's torque explains so much of the effort that friction and
-rotor leave, and is no less than this share of the largest joint's.
-"""
 
 
 class Identified(NamedTuple):
@@ -68,10 +54,10 @@ class Identified(NamedTuple):
 
 def noise_of(samples: Floats) -> Floats:
     """
-    Return the standard deviation of white noise on each column, from third differences.
+    Return the standard deviation of white noise on each column, by third differences.
 
-    The root mean square within six times the 90 % quantile, so that gaps and shocks do not count
-    but the rare steps of a resting encoder do.
+    Those above six times the 90 % quantile, of gaps and shocks, do not count, but the rare steps
+    of a resting encoder do.
     """
     third = np.diff(samples, n=3, axis=0)
     bound = 6.0 * np.quantile(np.abs(third), 0.9, axis=0)
@@ -83,24 +69,11 @@ def identify(
     model: ArmModel, t: Floats, q: Floats, effort: Floats, *, torque_constants: ArrayLike = 1.0
 ) -> Identified:
     """
-    Find what the torque of an arm in free motion says about it.
+    Find what the torque of an arm in free motion says about it, beyond the URDF of `model`.
 
-    Parameters
-    ----------
-    model : ArmModel
-        By the URDF.
-    t : (K,) array
-        s, increasing.
-    q, effort : (K, n) array
-        Positions, and torques or currents.
-    torque_constants : number or (n,) array
-        Torque for a unit of effort; 0 where that is not known and has to be found.
-
-    Raises
-    ------
-    ConfigurationError
-        Too short a recording.
-
+    Takes increasing times t (K,) in s, positions q (K, n), efforts (K, n), and the torque for a
+    unit of effort, a number or (n,); 0 where that is not known and has to be found. Raises
+    ConfigurationError for a recording that is too short, or does not tell any such torque.
     """
     n = len(model.joints)
     problem = _Regression(model, t, q, effort, Calibration.of_urdf(model), torque_constants)
@@ -115,14 +88,12 @@ def identify(
     for name, v in zip(model.joints, problem.velocity.T, strict=True):
         ahead = v[np.abs(v) > STILL] > 0.0
         if not len(ahead):
-            problem.notes.append(
-                f'{name} hardly moved (at most {np.abs(v).max():.2g} rad/s): what is found of it '
-                'is mostly the URDF'
-            )
+            most = f'at most {np.abs(v).max():.2g} rad/s'
+            note = f'{name} hardly moved ({most}): what is found of it is mostly the URDF'
+            problem.notes.append(note)
         elif not ONE_WAY <= np.mean(ahead) <= 1.0 - ONE_WAY:
-            problem.notes.append(
-                f'{name} moved one way only: its friction cannot be told from its offset'
-            )
+            note = f'{name} moved one way only: its friction cannot be told from its offset'
+            problem.notes.append(note)
     motor_inertia, offset, viscous, *coulomb = x[10 * n :].reshape(-1, n)
     calibration = Calibration(
         model.joints, model.unloaded + x[: 10 * n].reshape(n, 10), motor_inertia, offset, viscous,
@@ -139,12 +110,11 @@ def unexplained(
     model: ArmModel, t: Floats, q: Floats, effort: Floats, calibration: Calibration
 ) -> tuple[Floats, Floats]:
     """Return the RMS of the torque that the URDF leaves, `model`, and a calibration, (n,) each."""
-    constants = calibration.torque_constants
     alone, calibrated = (
-        _rms(_Regression(model, t, q, effort, known, constants).unexplained)
+        _Regression(model, t, q, effort, known, calibration.torque_constants).unexplained
         for known in (Calibration.of_urdf(model), calibration)
     )
-    return alone, calibrated
+    return _rms(alone), _rms(calibrated)
 
 
 def payload_of_motion(
@@ -162,9 +132,10 @@ def payload_of_motion(
     def missed(payload: Floats) -> Floats:
         return np.asarray(problem.unexplained - columns @ model.inertial_of(payload))
 
+    place = np.full(3, FARTHEST)
     payload = least_squares(
         lambda payload: (missed(payload) / problem.size).ravel(), [0.1, 0.0, 0.0, 0.0],
-        bounds=([0.0, *[-FARTHEST] * 3], [np.inf, *[FARTHEST] * 3]),
+        bounds=([0.0, *-place], [np.inf, *place]),
     ).x  # fmt: skip
     return payload, _rms(problem.unexplained), _rms(missed(payload))
 
@@ -218,15 +189,13 @@ class _Regression:
         by_model = regressors @ (known.inertial + model.inertial - model.unloaded).ravel()
         by_model += np.einsum('cj,ckj->kj', factors, own)
         self.notes: list[str] = []
-        self.constants = np.broadcast_to(np.asarray(torque_constants, dtype=np.float64), n).copy()
-        unknown = np.flatnonzero(self.constants == 0.0)
-        if len(unknown):
-            self.constants[unknown] = self._told(unknown, by_model, effort, own)
+        self.constants = np.array(np.broadcast_to(torque_constants, n), dtype=np.float64)
+        if not self.constants.all():
+            self._find_constants(by_model, effort, own)
         self.torque = effort * self.constants
         self.unexplained = self.torque - by_model
-        self.columns = np.concatenate(
-            [regressors, *(np.eye(n) * c[:, np.newaxis] for c in own)], axis=2
-        )
+        of_joints = [np.eye(n) * column[:, np.newaxis] for column in own]
+        self.columns = np.concatenate([regressors, *of_joints], axis=2)
         mass, spread = model.inertial[:, 0], np.abs(model.inertial[:, [4, 6, 9]]).max(axis=1)
         second = spread + mass * LEVER**2
         inertial = np.column_stack([mass, *[mass * LEVER] * 3, *[second] * 6])
@@ -237,39 +206,33 @@ class _Regression:
         ])  # fmt: skip
         self.size = np.maximum(_rms(self.unexplained), 1e-9)
 
-    def _told(
-        self, unknown: NDArray[np.intp], by_model: Floats, effort: Floats, own: Floats
-    ) -> Floats:
-        """Return torque constants by the URDF; where it does not tell, those of the others."""
-        constants, told = np.zeros(len(unknown)), np.zeros(len(unknown), dtype=bool)
-        for k, j in enumerate(unknown):
+    def _find_constants(self, by_model: Floats, effort: Floats, own: Floats) -> None:
+        """Find unknown torque constants by the URDF; what it does not tell is as of the others."""
+        found, unknown = {}, np.flatnonzero(self.constants == 0.0)
+        for j in unknown:
             # The effort is fitted by the torque, not the torque by the effort: what else is in the
             # effort would make the constant too small. Friction and rotor are taken from both.
             both, others = np.column_stack([by_model[:, j], effort[:, j]]), own[..., j].T
             x, y = (both - others @ np.linalg.lstsq(others, both, rcond=None)[0]).T
-            if x @ y > 0.0:
-                explained, size = (x @ y) ** 2 / (x @ x * (y @ y)), np.sqrt(x @ x / len(x))
-                told[k] = explained > TOLD and size > WEAK * by_model.std(axis=0).max()
-                constants[k] = x @ x / (x @ y)
-        if not told.any():
+            explains = (x @ y) ** 2 > TOLD * (x @ x) * (y @ y)
+            size = np.sqrt(x @ x / len(x))
+            if x @ y > 0.0 and explains and size > WEAK * by_model.std(axis=0).max():
+                found[j] = x @ x / (x @ y)
+        if not found:
             raise ConfigurationError(
                 'torque_constants: expected them as a parameter, because this motion does not '
                 'tell the torque of a unit of effort, got none'
             )
-        usual = float(np.median(constants[told]))
+        usual = float(np.median(list(found.values())))
+        self.constants[unknown] = [found.get(j, usual) for j in unknown]
         self.notes += [
             f'{self._model.joints[j]}: the torque of a unit of effort cannot be told from this '
             f'motion; taken for {usual:.3g}, as of the other joints (parameter torque_constants)'
-            for j in unknown[~told]
+            for j in unknown if j not in found
         ]  # fmt: skip
-        return np.asarray(np.where(told, constants, usual))
 
     def solve(self, rows: NDArray[np.bool_], draw: float, possible: bool = False) -> Floats:
-        """
-        Return the columns' factors by robust least squares, drawn towards the URDF.
-
-        With `possible` they are those of links that can exist.
-        """
+        """Return the columns' factors, drawn towards the URDF; of links that are `possible`."""
         a = (self.columns[rows] * self._scale).reshape(-1, len(self._scale))
         b, count = self.unexplained[rows], len(self.size)
         x, size = np.zeros(len(self._scale)), self.size
@@ -315,11 +278,10 @@ class _Regression:
             clipped = clipped @ vectors.transpose(0, 2, 1)
             near = np.concatenate([clipped.ravel(), np.maximum(there[16 * n :], 0.0)])
             dual = there - near
-        bodies, others = slice(0, 11 * n), slice(11 * n, None)
-        x[bodies] = np.linalg.lstsq(map_[:, bodies], near - start, rcond=None)[0]
-        x[others] = np.linalg.solve(
-            normal[others, others], right[others] - normal[others, bodies] @ x[bodies]
-        )
+        body, other = slice(0, 11 * n), slice(11 * n, None)
+        x[body] = np.linalg.lstsq(map_[:, body], near - start, rcond=None)[0]
+        coupled = normal[other, body] @ x[body]
+        x[other] = np.linalg.solve(normal[other, other], right[other] - coupled)
         return np.asarray(x)
 
 

@@ -1,13 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rigid-body terms of an arm with a fixed base, by Pinocchio; the only file that knows it."""
+"""
+What is known of an arm: by its URDF, and what `calibrate` finds beyond that.
+
+No other file knows Pinocchio.
+"""
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from dataclasses import asdict, dataclass
+from typing import Any, NamedTuple
 from xml.etree import ElementTree
 
+from fhaosmo_ros.core.parameters.declaration import shown
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+import yaml
 
 try:
     import pinocchio as pin
@@ -15,10 +22,10 @@ except ImportError:
     pin = None
 
 Floats = NDArray[np.float64]
-GRIPPER = ('finger', 'gripper', 'knuckle')
+GRIPPER = 'finger', 'gripper', 'knuckle'
 """Joints with such a word in their name are left out if none are named."""
-POSTURES = 200
-"""Random postures over which the torque of the arm's weight is averaged."""
+WIDTHS = 0.01, 0.03, 0.1, 0.3  # rad/s: how fast friction changes its sign, tanh(velocity / width)
+POSTURES = 200  # random ones over which the torque of the arm's weight is averaged
 
 
 class Terms(NamedTuple):
@@ -53,7 +60,6 @@ class ArmModel:
         Limits of the URDF, rad and rad/s; m and m/s for a prismatic joint.
     inertial : (n, 10) array
         Of each link with its payload; `unloaded` without it.
-    gravity : (3,) array
 
     Raises
     ------
@@ -73,10 +79,9 @@ class ArmModel:
             mimics = [j.get('name') for j in ElementTree.fromstring(urdf).iterfind('joint[mimic]')]
             whole = pin.buildModelFromXML(urdf)
         except (ElementTree.ParseError, ValueError) as error:
-            raise ConfigurationError(
-                f'robot description: expected a URDF, got {urdf[:40]!r} ({error})'
-            ) from None
-        moving = list(whole.names)[1:]
+            text = f'robot description: expected a URDF, got {urdf[:40]!r} ({error})'
+            raise ConfigurationError(text) from None
+        moving = dict(zip(list(whole.names)[1:], list(whole.joints)[1:], strict=True))
         chosen = list(joints) or [
             name for name in moving
             if name not in mimics and not any(word in name.lower() for word in GRIPPER)
@@ -87,7 +92,7 @@ class ArmModel:
             )
         if not chosen:
             raise ConfigurationError('robot description: expected a joint that moves, got none')
-        for name, joint in zip(moving, list(whole.joints)[1:], strict=True):
+        for name, joint in moving.items():
             if joint.nv > 1:
                 raise ConfigurationError(
                     f'joint {name}: expected a fixed base and joints that turn or slide along '
@@ -130,20 +135,17 @@ class ArmModel:
         """
         self.inertial = self.unloaded.copy()
         self.inertial[-1] += self.inertial_of(payload)
-        even = []
-        for k, values in enumerate(self.inertial, 1):
+        self._even = np.zeros((len(self.inertial), 6, 6))
+        for k, (values, link) in enumerate(zip(self.inertial, self.links, strict=True)):
             if not values[0] > 0.0:
-                raise ConfigurationError(
-                    f'link {self.links[k - 1]}: expected a mass > 0, got {values[0]:g}'
-                )
-            own = self._model.inertias[k] = pin.Inertia.FromDynamicParameters(values)
+                raise ConfigurationError(f'link {link}: expected a mass > 0, got {values[0]:g}')
+            own = self._model.inertias[k + 1] = pin.Inertia.FromDynamicParameters(values)
             # A force of any direction at the place r from the centre has the moment r x force.
             # Over places spread as the mass is, each component has 2/3 of their mean square
             # distance, which is half the trace of the inertia over the mass. So J^T J of a link is
             # that of its centre, weighted by 1 kg with an inertia of that mean square.
             square = max(np.trace(own.inertia), 0.0) / (3.0 * own.mass)
-            even.append(pin.Inertia(1.0, own.lever, square * np.eye(3)).matrix())
-        self._even = np.array(even)
+            self._even[k] = pin.Inertia(1.0, own.lever, square * np.eye(3)).matrix()
         rest = np.zeros(len(self.joints))
         mass = self.terms(rest, rest).mass
         if not np.all(np.linalg.eigvalsh(mass) > 0.0):
@@ -158,13 +160,14 @@ class ArmModel:
         point = pin.Inertia(mass, np.array(center), np.zeros((3, 3)))
         return np.asarray(point.toDynamicParameters())
 
-    def _configuration(self, q: Floats) -> Floats:
-        """Return q as Pinocchio has it: cosine and sine of a continuous joint's angle."""
-        return pin.integrate(self._model, self._zero, q) if self._turns else q
+    def _at(self, q: Floats) -> tuple[Any, Any, Floats]:
+        """Return what Pinocchio takes first; q has cosine and sine of a continuous joint."""
+        configuration = pin.integrate(self._model, self._zero, q) if self._turns else q
+        return self._model, self._data, configuration
 
     def terms(self, q: Floats, velocity: Floats) -> Terms:
         """Return the terms at q (n,) and its velocity (n,)."""
-        at = self._model, self._data, self._configuration(q)
+        at = self._at(q)
         coriolis = pin.computeCoriolisMatrix(*at, velocity).copy()
         gravity = pin.computeGeneralizedGravity(*at).copy()
         return Terms(pin.crba(*at).copy(), coriolis, gravity)
@@ -176,16 +179,16 @@ class ArmModel:
 
     def reach_of_links(self, q: Floats) -> Floats:
         """Return J^T J of each link, the mean over the places of its mass, (n, n, n), m^2."""
-        model, data, local = self._model, self._data, pin.ReferenceFrame.LOCAL
-        pin.computeJointJacobians(model, data, self._configuration(q))
-        links = range(1, model.njoints)
-        jacobians = np.array([pin.getJointJacobian(model, data, k, local) for k in links])
-        jacobians = jacobians.reshape(-1, 6, model.nv)  # of one joint Pinocchio has (6,)
+        pin.computeJointJacobians(*self._at(q))
+        local, n = pin.ReferenceFrame.LOCAL, len(q)
+        jacobians = np.array(
+            [pin.getJointJacobian(self._model, self._data, k + 1, local) for k in range(n)]
+        ).reshape(n, 6, n)  # of one joint Pinocchio has (6,)
         return np.asarray(jacobians.transpose(0, 2, 1) @ self._even @ jacobians)
 
     def gravity_columns(self, q: Floats) -> Floats:
         """Return the matrix (n, 3) whose product with a vector of gravity is g(q)."""
-        center = pin.jacobianCenterOfMass(self._model, self._data, self._configuration(q))
+        center = pin.jacobianCenterOfMass(*self._at(q))
         return np.asarray(-np.sum(self.inertial[:, 0]) * center.reshape(3, -1).T)
 
     def frame_jacobian(self, q: Floats, frame: str) -> Floats:
@@ -194,14 +197,12 @@ class ArmModel:
         if not model.existFrame(frame):
             known = [f.name for f in model.frames if f.type == pin.FrameType.BODY]
             raise ConfigurationError(f'frame: expected one of {", ".join(known)}, got {frame!r}')
-        at = model, self._data, self._configuration(q), model.getFrameId(frame)
-        jacobian = pin.computeFrameJacobian(*at, pin.ReferenceFrame.LOCAL)
-        return np.asarray(jacobian.reshape(6, -1))
+        at = *self._at(q), model.getFrameId(frame), pin.ReferenceFrame.LOCAL
+        return np.asarray(pin.computeFrameJacobian(*at).reshape(6, -1))
 
     def regressor(self, q: Floats, velocity: Floats, acceleration: Floats) -> Floats:
         """Return the matrix (n, 10 n) whose product with `inertial`, as one row, is the torque."""
-        at = self._model, self._data, self._configuration(q)
-        regressor = pin.computeJointTorqueRegressor(*at, velocity, acceleration)
+        regressor = pin.computeJointTorqueRegressor(*self._at(q), velocity, acceleration)
         return np.array(regressor.reshape(len(q), -1))
 
     def pseudo_inertias(self) -> Floats:
@@ -227,3 +228,60 @@ class ArmModel:
     def weight(self) -> float:
         """Of all that moves, N."""
         return float(np.sum(self.inertial[:, 0]) * np.linalg.norm(self.gravity))
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """What is known of an arm beyond its URDF; zeros where nothing is."""
+
+    joints: tuple[str, ...]
+    inertial: Floats  # (n, 10) of each link in Pinocchio's order, without payload
+    motor_inertia: Floats  # (n,) of rotors, as joints see it, kg m^2
+    offset: Floats  # (n,) of the measured torque, N m
+    viscous: Floats  # (n,) friction for a velocity, N m s/rad
+    coulomb: Floats  # (n, k) friction for tanh(velocity / width) with each of `WIDTHS`, N m
+    torque_constants: Floats  # (n,) N m for one unit of effort
+    position_noise: Floats  # (n,) as the parameter, which counts where this is 0
+    torque_noise: Floats  # (n,) likewise
+    model_error: Floats  # (n,) likewise
+    log_odds: float | Floats = 0.0  # of contact, once a minute in the free motion; 0: not known
+
+    @classmethod
+    def of_urdf(cls, model: ArmModel) -> 'Calibration':
+        """Return that of an arm of which only the URDF is known."""
+        none = np.zeros(len(model.joints))
+        dry = np.zeros((len(none), len(WIDTHS)))
+        return cls(
+            model.joints, model.unloaded, none, none, none, dry, none + 1.0, none, none, none
+        )
+
+    def friction(self, velocity: Floats) -> Floats:
+        """Return friction and offset at velocities (..., n), in N m."""
+        dry = np.sum(self.coulomb * np.tanh(velocity[..., np.newaxis] / WIDTHS), axis=-1)
+        return np.asarray(self.offset + self.viscous * velocity + dry)
+
+    def dumps(self) -> str:
+        """Return the text of the file."""
+        values = {name: np.asarray(value).tolist() for name, value in asdict(self).items()}
+        return yaml.safe_dump({'arm_calibration': values}, sort_keys=False, width=100)
+
+    @classmethod
+    def loads(cls, text: str) -> 'Calibration':
+        """Return what a file says; raise ConfigurationError for one that is none, or not whole."""
+        try:
+            given = dict(yaml.safe_load(text)['arm_calibration'])
+            joints = tuple(map(str, given.pop('joints')))
+            arrays = {name: np.array(v, dtype=np.float64) for name, v in given.items()}
+            found = cls(joints, **arrays)
+        except (yaml.YAMLError, TypeError, KeyError, ValueError) as error:
+            got = f'{text[:40]!r} ({" ".join(str(error).split())})'
+            problem = f'calibration: expected a file of `calibrate`, got {got}'
+            raise ConfigurationError(problem) from None
+        n = len(joints)
+        shapes = {'inertial': (n, 10), 'coulomb': (n, len(WIDTHS)), 'log_odds': ()}
+        for name, array in arrays.items():
+            shape = shapes.get(name, (n,))
+            if array.shape != shape or not np.isfinite(array).all():
+                text = f'expected finite numbers of shape {shape}, got {shown(array)}'
+                raise ConfigurationError(f'calibration: {name}: {text}')
+        return found

@@ -1,82 +1,29 @@
 # SPDX-License-Identifier: Apache-2.0
 """What samples of an arm say by themselves: which can be used, their noise, and their time."""
 
-from contextlib import suppress
-
 from libc.math cimport fabs, floor, fmax, fmin, INFINITY, isnan, M_PI, NAN, sqrt
 
 import numpy as np
 
-# Stamps are evened out over so many samples. Even intervals are used where motion misses them by
-# the factor at most; of what was remembered of both, KEEP is still remembered one sample later.
-cdef int LONGEST = 200
+cdef int LONGEST = 200  # samples over which stamps are evened out
+# Even intervals are used where motion misses them by the factor at most; of what was remembered of
+# both kinds of intervals, KEEP is still remembered one sample later.
 cdef double BETTER = 0.8, KEEP = 0.995
-# The median of so many intervals is the period that the even clock begins with.
-cdef int LEARNT = 20
-# By such a share of a period a stamp has to be late until a sample is taken as missing.
-cdef double MISSING = 0.7
+cdef int LEARNT = 20  # the even clock begins with the median of so many intervals
+cdef double MISSING = 0.7  # share of a period by which a stamp is late where a sample is missing
 # Square of the standard deviations by which joints may miss where their velocity would bring them.
 cdef double STRAIGHT = 100.0
-# Steps of an encoder by which a position may be off, however near samples are.
-cdef double OFF = 3.0
-# A driver may publish what it has read so many times more.
-cdef int MOST_REPEATS = 10
+cdef double STEP = sqrt(12.0)  # of an encoder, in standard deviations of its error of rounding
+cdef double OFF = 3.0  # of these steps a position may be off, however near samples are
+cdef int MOST_REPEATS = 10  # so many times more a driver may publish what it has read
 # Samples over which noise is averaged, at the start and later; an impact counts as three standard
 # deviations at most.
 cdef int FIRST_LEARNT = 10, LONGEST_LEARNT = 1000
 cdef double LARGEST = 9.0
-# Seconds without a sample, or back in time, after which one is a first one.
-cdef double MAX_GAP = 0.1
-
+cdef double MAX_GAP = 0.1  # s without a sample, or back in time, after which one is a first one
 
 FAULTS = ('too strong', 'beyond limits', 'too fast')
 """What an effort, a position and a velocity can be that no arm has."""
-
-
-cdef class Noise:
-    """
-    The variance of the noise of samples, followed by their third differences.
-
-    Parameters
-    ----------
-    size : (r, n) array
-        Standard deviation of r kinds of samples, to begin with.
-    least, most : (r, n) array
-        The smallest and the largest that it can become.
-
-    """
-
-    cdef readonly object variance  # (r, n)
-    cdef double[:, ::1] now, least, most
-    cdef double[:, :, ::1] before  # the three samples before
-    cdef int count  # of what is averaged
-
-    def __cinit__(self, size, least, most):
-        self.now, self.least, self.most = np.square(np.broadcast_arrays(size, least, most))
-        self.variance = np.asarray(self.now)
-        self.before = np.full((3, *self.variance.shape), np.nan)
-        self.count = FIRST_LEARNT
-
-    def reset(self):
-        """Take the next sample as the first one."""
-        self.before[:, :, :] = NAN
-
-    cdef void take(self, const double[:, ::1] sample) noexcept:
-        """Take a sample, (r, n)."""
-        cdef double[:, :, ::1] b = self.before
-        cdef double change, square, found
-        cdef Py_ssize_t i, k
-        cdef bint known = not isnan(b[0, 0, 0])
-        if known:
-            self.count = min(self.count + 1, LONGEST_LEARNT)
-        for i in range(self.now.shape[0]):
-            for k in range(self.now.shape[1]):
-                if known:
-                    change = sample[i, k] - 3.0 * (b[2, i, k] - b[1, i, k]) - b[0, i, k]
-                    square = fmin(change * change / 20.0, LARGEST * self.now[i, k])  # 1+9+9+1
-                    found = self.now[i, k] + (square - self.now[i, k]) / self.count
-                    self.now[i, k] = fmin(fmax(found, self.least[i, k]), self.most[i, k])
-                b[0, i, k], b[1, i, k], b[2, i, k] = b[1, i, k], b[2, i, k], sample[i, k]
 
 
 cdef class Clock:
@@ -95,8 +42,8 @@ cdef class Clock:
     time that has passed. Where that is as the stamp says, the even clock begins anew.
     """
 
-    cdef readonly bint even  # even intervals are used
-    cdef readonly double vague  # share of what has moved at the latest sample that is not known
+    cdef bint even  # even intervals are used
+    cdef double vague  # share of what has moved at the latest sample that is not known
     cdef double phase  # of the even clock, from the latest stamp (s)
     cdef double period  # s
     cdef int count  # stamps evened out
@@ -104,19 +51,12 @@ cdef class Clock:
     cdef double missed_by_stamps, missed_by_even  # rad^2, of the latest samples
 
     def __cinit__(self):
-        self.reset()
-
-    def reset(self):
-        """Forget everything."""
-        self.even, self.count = False, 0
-        self.vague = self.phase = self.period = 0.0
-        self.missed_by_stamps = self.missed_by_even = 0.0
         self.first = []
 
-    cpdef double interval(
+    cdef double interval(
         self, double h, const double[::1] moved, const double[::1] velocity,
         const double[::1] variance,
-    ) except -1.0:
+    ):
         """
         Return the time in which the joints have `moved`; `h` is that of the stamps (s).
 
@@ -124,10 +64,8 @@ cdef class Clock:
         """
         cdef double total = 0.0, along = 0.0, square = 0.0, noise = 0.0, even
         cdef double told = h, sure = INFINITY  # time by the motion, and how exact it is (s)
-        cdef Py_ssize_t k, n = moved.shape[0]
-        if not n == velocity.shape[0] == variance.shape[0]:
-            raise ValueError(f'expected arrays of {n} joints')
-        for k in range(n):
+        cdef Py_ssize_t k
+        for k in range(moved.shape[0]):
             total += moved[k] * moved[k]
             along += moved[k] * velocity[k]
             square += velocity[k] * velocity[k]
@@ -186,66 +124,51 @@ cdef class Samples:
     """
     How the joints have moved from one sample to the next, in which time, and how noisy that is.
 
-    Samples are (3, n): efforts, positions and velocities.
-
-    Parameters
-    ----------
-    noise : Noise
-    constants : (n,) array
-        Torque for a unit of effort.
-    lowest, highest : (3, n) array
-        What an arm can have.
-    step : (n,) array
-        Of the encoders.
-    stopping : (n,) array
-        Torques by which no arm is stopped between two samples.
-    turning : (n,) array of bool
-        Joints whose angle has no end.
-    of_position : bool
-        True if positions say how the joints have moved, False if velocities do.
-
+    A sample is (3, n): efforts, positions and velocities. `noise` (3, 3, n) are the standard
+    deviations of its noise to begin with, and the least and largest ones that are found; `limits`
+    (2, 3, n) lie below and above what an arm can have. `constants` (n,) are the torques for a unit
+    of effort, and torques of `stopping` (n,) stop no arm between two samples. The angles of
+    `turning` (n,) joints have no end. Positions say how the joints have moved if `of_position` is
+    true, else velocities do.
     """
 
-    cdef readonly double h, vague  # time in which the joints moved, and share that is not known
-    cdef readonly object way, change, speed  # (n,): moved, what `Bank.step` takes, velocities
-    # The latest sample, and its rows: written anew by the next one.
-    cdef readonly object sample, torque, position, velocity
-    cdef readonly Noise noise
-    cdef readonly Clock clock
-    cdef double[:, ::1] lowest, highest
-    cdef double[:, ::1] now
-    cdef double[::1] constants, step, stopping, rest, before, moved, rate
+    cdef readonly double h, vague  # time in which the joints moved (s), and share not known of it
+    # Of the latest sample, (n,), and how far the joints moved: written anew by the next one.
+    cdef readonly object torque, position, velocity, way
+    cdef readonly object variance  # (3, n) of the noise of samples
+    cdef Clock clock
+    cdef double[:, ::1] now, found, least, most, lowest, highest
+    cdef double[:, :, ::1] past  # the three samples before
+    cdef double[::1] constants, stopping, step, rest, before, moved
     cdef unsigned char[::1] turning
     cdef bint of_position, begun, still
+    cdef int count  # samples over which noise is averaged
     cdef int repeats  # samples in a row that a driver has published once more
     cdef long long time, newest  # of the latest sample that counts, and of any
 
-    def __cinit__(
-        self, Noise noise not None, constants, lowest, highest, step, stopping, turning,
-        bint of_position,
-    ):
-        cdef Py_ssize_t n = len(step)
-        given = noise.variance, lowest, highest, constants, step, stopping, turning
-        if [*map(np.shape, given)] != [(3, n)] * 3 + [(n,)] * 4:
-            raise ValueError(f'expected arrays of {n} joints')
-        self.noise, self.clock = noise, Clock()
-        self.of_position, self.constants = of_position, np.array(constants, dtype=np.float64)
-        self.now = self.sample = np.zeros((3, n))
-        self.torque, self.position, self.velocity = self.sample
-        self.lowest, self.highest, self.step, self.stopping = lowest, highest, step, stopping
+    def __cinit__(self, noise, limits, constants, stopping, turning, bint of_position):
+        cdef Py_ssize_t n = len(constants)
+        if np.shape(noise) != (3, 3, n) or np.shape(limits) != (2, 3, n):
+            raise ValueError(f'expected noise and limits of {n} joints')
+        self.variance, self.least, self.most = np.square(noise)
+        self.found, self.past = self.variance, np.zeros((3, 3, n))
+        self.lowest, self.highest = limits
+        self.constants, self.stopping = np.array([constants, stopping])
         self.turning = np.array(turning, dtype=np.uint8)
-        self.rest, self.before, self.moved, self.rate = np.zeros((4, n))
-        self.way, self.speed = np.asarray(self.moved), np.asarray(self.rate)
-        self.change = self.way if of_position else self.speed
-        self.newest = -(1 << 62)
+        self.of_position, self.step = of_position, STEP * noise[0][1]
+        self.rest, self.before, self.way = np.zeros((3, n))
+        self.now = sample = np.zeros((3, n))
+        self.torque, self.position, self.velocity = sample
+        self.moved = self.way
+        self.count, self.newest = FIRST_LEARNT, -(1 << 62)
         self.reset()
 
     def reset(self):
         """Take the next sample as the first one."""
         self.begun = self.still = False
         self.repeats = 0
-        self.clock.reset()
-        self.noise.reset()
+        self.clock = Clock()
+        self.past[:, :, :] = NAN
 
     cpdef bint is_possible(self, int row, const double[::1] values) except -1:
         """Return True if an arm can have these values, (n,), in a row of a sample."""
@@ -259,40 +182,35 @@ cdef class Samples:
 
     def take(self, long long time, effort, position, velocity, known, const double[::1] motion):
         """
-        Go on to a sample.
+        Go on to a sample of a `time` in ns, and return why it cannot be used, '' if it can.
 
-        Parameters
-        ----------
-        time : int
-            ns.
-        effort, position, velocity : (n,) array
-        known : (n,) array or None
-            Velocity estimated at the sample before; None if it is not known yet.
-        motion : (n,) array
-            M times `change` of the sample before.
-
-        Returns
-        -------
-        str
-            Empty if the sample can be used, else why not: one of `FAULTS` or 'wrong size', 'not
-            finite', 'not newer', 'standing still', 'repeated' (a joint that moves by more than a
-            step of its encoder shows it), 'jumped', after which the next sample is the first; and
-            the first one itself, 'first', 'clock set back' or 'restarts' (after a gap).
-
+        `known` (n,) is the velocity estimated at the sample before, None if there is none yet, and
+        `motion` (n,) M times `change` of that sample. What cannot be used is one of `FAULTS`, or
+        'wrong size', 'not finite', 'not newer', 'standing still', 'repeated' (a joint that moves
+        by more than a step of its encoder shows it), 'jumped', after which the next sample is the
+        first; and the first one itself, 'first', 'clock set back' or 'restarts' (after a gap).
         """
         cdef const double[::1] likely = self.rest if known is None else known
+        cdef const double[:] e, q, v
         cdef int i, k, n = self.step.shape[0]
         cdef double over  # what divides `motion` to have p
         cdef bint moves = False, repeated = False, back
         if not n == likely.shape[0] == motion.shape[0]:
             raise ValueError(f'expected arrays of {n} joints')
-        given = effort, position, velocity
-        for i in range(3):
-            if not self.read(i, given[i]):
+        try:
+            e, q, v = effort, position, velocity
+        except (TypeError, ValueError):  # no arrays of doubles, as library users may have them
+            try:
+                e, q, v = np.array((effort, position, velocity), dtype=np.float64)
+            except (TypeError, ValueError):
                 return 'wrong size'
+        if not n == e.shape[0] == q.shape[0] == v.shape[0]:
+            return 'wrong size'
+        for k in range(n):
+            self.now[0, k], self.now[1, k], self.now[2, k] = self.constants[k] * e[k], q[k], v[k]
         for i in range(3):
             if not self.is_possible(i, self.now[i]):
-                return FAULTS[i] if np.isfinite(self.sample).all() else 'not finite'
+                return FAULTS[i] if np.isfinite(self.now).all() else 'not finite'
         back = time < self.newest - MAX_GAP * 1e9
         if time <= self.newest and not back:
             return 'not newer'
@@ -319,34 +237,35 @@ cdef class Samples:
             return 'standing still'
         if self.h > MAX_GAP:
             return self.begin(time, 'restarts')
-        self.h = self.clock.interval(self.h, self.moved, likely, self.noise.now[1])
+        self.h = self.clock.interval(self.h, self.moved, likely, self.found[1])
         for k in range(n):
             if fabs(self.moved[k]) > self.highest[2, k] * self.h + OFF * self.step[k]:
                 self.reset()
                 return 'jumped'
-            self.rate[k] = self.moved[k] / self.h if self.of_position else self.now[2, k]
         self.vague = self.clock.vague if self.of_position else 0.0
-        self.noise.take(self.now)
+        self.learn_noise()
         self.time, self.before[:] = time, self.now[1]
         return ''
-
-    cdef bint read(self, int row, numbers) except -1:
-        """Take a row of a sample; return False if it has another size, or is not of numbers."""
-        cdef const double[:] values = None
-        cdef int k
-        try:
-            values = numbers
-        except (TypeError, ValueError):  # no array of doubles, as library users may have them
-            with suppress(TypeError, ValueError):
-                values = np.asarray(numbers, dtype=np.float64)
-        if values is None or values.shape[0] != self.step.shape[0]:
-            return False
-        for k in range(values.shape[0]):
-            self.now[row, k] = values[k] * (1.0 if row else self.constants[k])
-        return True
 
     cdef str begin(self, long long time, str problem):
         """Take a sample as the first one, and return why it is that."""
         self.reset()
         self.begun, self.time, self.before[:] = True, time, self.now[1]
         return problem
+
+    cdef void learn_noise(self):
+        """Follow the variance of the noise by third differences."""
+        cdef double[:, :, ::1] b = self.past
+        cdef double change, square, found
+        cdef Py_ssize_t i, k
+        cdef bint known = not isnan(b[0, 0, 0])
+        if known:
+            self.count = min(self.count + 1, LONGEST_LEARNT)
+        for i in range(3):
+            for k in range(self.step.shape[0]):
+                if known:
+                    change = self.now[i, k] - 3.0 * (b[2, i, k] - b[1, i, k]) - b[0, i, k]
+                    square = fmin(change * change / 20.0, LARGEST * self.found[i, k])  # 1+9+9+1
+                    found = self.found[i, k] + (square - self.found[i, k]) / self.count
+                    self.found[i, k] = fmin(fmax(found, self.least[i, k]), self.most[i, k])
+                b[0, i, k], b[1, i, k], b[2, i, k] = b[1, i, k], b[2, i, k], self.now[i, k]

@@ -7,19 +7,18 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from fhaosmo_ros.core.arm import identification
 from fhaosmo_ros.core.arm.arm import Arm
-from fhaosmo_ros.core.arm.identification import identify, payload_of_motion, unexplained
 from fhaosmo_ros.core.arm.model import Floats
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.stop_signals import Stop
-from fhaosmo_ros.tools.arm import recording
-from fhaosmo_ros.tools.arm.figure import torque_figure
+from fhaosmo_ros.tools.arm.replay import add_options, arm_parameters, description, joint_samples
 from fhaosmo_ros.tools.bags.reader import BagReader
 from fhaosmo_ros.tools.cli.command import output_at, run_command
+from matplotlib.figure import Figure
 import numpy as np
 
-LEAST = 1.0
-"""The least log-odds that count as contact, however quiet the recording is."""
+LEAST = 1.0  # log-odds that count as contact, at least, however quiet the recording is
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -30,10 +29,6 @@ def main(argv: list[str] | None = None) -> int:
         'states in which nothing touches it, and write them to a file for the node arm.',
     )
     parser.add_argument('--bag', type=Path, required=True, help='a minute of free motion')
-    parser.add_argument(
-        '-o', '--output', type=Path, default=Path('calibration.yaml'), metavar='FILE',
-        help='file to write, with a figure beside it (default: %(default)s)',
-    )  # fmt: skip
     known = parser.add_mutually_exclusive_group()
     known.add_argument(
         '--payload', action='store_true',
@@ -43,24 +38,24 @@ def main(argv: list[str] | None = None) -> int:
         '--check', action='store_true',
         help='find nothing; say how well calibration_file explains this bag, of another day say',
     )  # fmt: skip
-    recording.add_arm_options(parser)
+    add_options(parser, 'calibration.yaml', 'file to write, with a figure beside it')
     return run_command(parser, argv, _calibrate)
 
 
 def _calibrate(arguments: argparse.Namespace, stop: Stop) -> None:
-    values = recording.arm_parameters(arguments) | {'measurement': 'position'}
+    values = arm_parameters(arguments) | {'measurement': 'position'}
     if (arguments.payload or arguments.check) and not values.get('calibration_file'):
         raise ConfigurationError(
             '--payload, --check: expected -p calibration_file:=FILE of the arm without payload, '
             'got none'
         )
     with stop.raising(), BagReader(arguments.bag) as reader:
-        urdf = recording.description(reader, arguments)
+        urdf = description(reader, arguments)
         unknown: dict[str, Any] = {'calibration_file': ''}
         if arguments.payload or arguments.check:
             unknown = {'payload': [0.0] * 4} if arguments.payload else {}
         arm = Arm(urdf, values | unknown)
-        stamps, rows = zip(*recording.joint_samples(reader, arguments.topic, arm), strict=True)
+        stamps, rows = zip(*joint_samples(reader, arguments.topic, arm), strict=True)
         when, samples = np.array(stamps), np.array(rows)
         newest = np.maximum.accumulate(np.concatenate([[0], when[:-1]]))
         good = np.isfinite(samples).all(axis=(1, 2)) & (when > newest)
@@ -70,11 +65,13 @@ def _calibrate(arguments: argparse.Namespace, stop: Stop) -> None:
             torque = effort + np.array([arm.model.terms(row, 0.0 * row).gravity for row in q])
         if arguments.check:
             alone = Arm(urdf, values | {'calibration_file': ''}).model  # with gravity and payload
-            left = unexplained(alone, t, q, torque, arm.calibration)
+            left = identification.unexplained(alone, t, q, torque, arm.calibration)
             print(_table(arm.joints, 'URDF', 'calibrated', *left))
             return
         if arguments.payload:
-            payload, *left = payload_of_motion(arm.model, t, q, torque, arm.calibration)
+            payload, *left = identification.payload_of_motion(
+                arm.model, t, q, torque, arm.calibration
+            )
             print(_table(arm.joints, 'without', 'with payload', *left))
             numbers = ', '.join(f'{x:.4g}' for x in payload)
             print(f'\npayload: [{numbers}]    # kg and m, in the frame of {arm.joints[-1]}')
@@ -83,7 +80,7 @@ def _calibrate(arguments: argparse.Namespace, stop: Stop) -> None:
         if arm.parameters['effort'] == 'current':
             given = np.array(arm.parameters['torque_constants'])
             constants = np.where(given == 1.0, 0.0, given)
-        found = identify(arm.model, t, q, torque, torque_constants=constants)
+        found = identification.identify(arm.model, t, q, torque, torque_constants=constants)
         # The log-odds of contact that this free motion reaches once a minute.
         free = Arm(urdf, values, calibration=found.calibration)
         odds = np.nan_to_num(free.run(t, q, effort).log_odds, nan=-np.inf)
@@ -99,7 +96,7 @@ def _calibrate(arguments: argparse.Namespace, stop: Stop) -> None:
     print(f'calibration: {arguments.output}')
     figure = arguments.output.with_suffix('.png')
     with output_at(figure, arguments.force) as path:
-        torque_figure(arm.joints, found).savefig(path, dpi=110)
+        _figure(arm.joints, found).savefig(path, dpi=110)
     print(f'figure:      {figure}')
 
 
@@ -111,3 +108,21 @@ def _table(joints: Sequence[str], without: str, with_: str, *left: Floats) -> st
     for name, before, after in zip(joints, *left, strict=True):
         lines.append(f'{name:{width}}{before:12.3g}{after:14.3g}{after / before:8.2f}')
     return '\n'.join(lines)
+
+
+def _figure(joints: Sequence[str], found: identification.Identified) -> Figure:
+    """Draw the measured torque of each joint, and what URDF and calibration say of it."""
+    n, t = len(joints), found.t - found.t[0]
+    figure = Figure((10.0, 1.3 * n + 1.0), layout='constrained')
+    rows = figure.subplots(n, 1, sharex=True, squeeze=False)[:, 0]
+    for j, (axes, name) in enumerate(zip(rows, joints, strict=True)):
+        axes.plot(t, found.by_urdf[:, j], color='tab:gray', lw=0.8, label='URDF')
+        axes.plot(t, found.torque[:, j], color='black', lw=1.2, label='measured')
+        axes.plot(t, found.by_calibration[:, j], color='tab:orange', lw=0.8, label='calibrated')
+        whole = axes.get_xaxis_transform()
+        axes.fill_between(t, 0, 1, found.held_out, transform=whole, fc='0.92', label='held out')
+        axes.set_title(f'{name}, N m', fontsize='small', loc='left')
+    rows[0].legend(ncols=4, fontsize='small', loc='upper right')
+    rows[-1].set_xlabel('time, s')
+    figure.suptitle('Torque in free motion')
+    return figure
