@@ -14,8 +14,13 @@ from fhaosmo_ros.core.parameters.files import load
 from fhaosmo_ros.messages.joints import joint_sample
 from fhaosmo_ros.stop_signals import Stop
 from fhaosmo_ros.tools.bags.reader import BagReader
-from fhaosmo_ros.tools.cli.command import output_at, progress, run_command
-from fhaosmo_ros.tools.cli.command import add_value_options, values_of
+from fhaosmo_ros.tools.cli.command import (
+    add_value_options,
+    output_at,
+    progress,
+    run_command,
+    values_of,
+)
 
 DESCRIPTION = '/robot_description'
 
