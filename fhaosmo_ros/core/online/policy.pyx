@@ -90,7 +90,7 @@ cdef struct Course:
     double held_y
     double mean_interval  # running mean of dt (ns)
     double mean_jitter  # running mean of its deviation (ns)
-    double usual_interval  # longest mean_interval of late; a restart does not forget it (ns)
+    double longest_mean  # longest mean_interval of late; a restart does not forget it (ns)
     int past_place  # of the latest piece of time with the same known inputs, in a ring of them
     int past_count  # of such pieces
 
@@ -368,17 +368,17 @@ cdef class Policy:
         word[0] = self.begin_again(elapsed > 0)
         follow = difference(now, course.held_stamp)
         if not 0 < follow <= longest:  # the rate is not known any more
-            course.usual_interval = 0.0
+            course.longest_mean = 0.0
             return 0
         if 0 < elapsed <= MOST_INTERVALS * FIRST_INTERVAL:  # the next one like this is none
-            course.usual_interval = max(course.usual_interval, 2.0 * elapsed / MOST_INTERVALS)
+            course.longest_mean = max(course.longest_mean, 2.0 * elapsed / MOST_INTERVALS)
         self.structure.start(course.held_y)
         course.latest = self.sensor.changed = course.held_stamp
         return follow
 
     cdef long long max_gap(self) noexcept nogil:
         """Return the longest interval that is stepped over (ns)."""
-        return self.longest(self.course.usual_interval or FIRST_INTERVAL)
+        return self.longest(self.course.longest_mean or FIRST_INTERVAL)
 
     cdef long long longest(self, double interval) noexcept nogil:
         """Return how far apart (ns) two stamps of one run may be, if intervals are such."""
@@ -527,8 +527,8 @@ cdef class Policy:
         if course.intervals == WINDOW:
             change = fmin(change, WINDOW * course.mean_interval)
         course.mean_interval += change / course.intervals
-        course.usual_interval = max(
-            course.mean_interval, course.usual_interval * (1.0 - 1.0 / MOST_INTERVALS)
+        course.longest_mean = max(
+            course.mean_interval, course.longest_mean * (1.0 - 1.0 / MOST_INTERVALS)
         )
         if course.intervals > 1:
             course.mean_jitter += (fabs(change) - course.mean_jitter) / course.intervals

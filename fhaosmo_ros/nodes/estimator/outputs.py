@@ -9,7 +9,7 @@ from typing import Any
 from builtin_interfaces.msg import Time
 from fhaosmo_ros.core.observer.estimates import Estimate, TUNING
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
-from fhaosmo_ros.core.online.snapshots import Flag, pack, Snapshot
+from fhaosmo_ros.core.online.snapshots import Flag, pack
 from fhaosmo_ros.core.parameters.declaration import Parameters
 from fhaosmo_ros.core.parameters.files import dumps
 from fhaosmo_ros.core.parameters.per_channel import differing
@@ -72,9 +72,8 @@ class Outputs:
 
         The next one is `due` (by perf_counter) a period later, after a reset with the next sample.
         """
-        stamp = self._estimator.latest
-        if stamp is not None:
-            labels, vector = pack(Snapshot(stamp, flags, self._estimator.state_dict()))
+        if self._estimator.latest is not None:
+            labels, vector = pack(flags, self._estimator.state_dict())
             if labels != self._labels:  # a state before a gap is there only after one
                 self._labels, self._message = labels, labelled(labels)
             self._snapshots.publish(self._message(vector))
