@@ -10,7 +10,7 @@ sample needs the inputs that arrived a lag of measurement_delay - input_delay be
 """
 
 from cpython.pythread cimport PyThread_get_thread_ident
-from libc.math cimport fabs, fmax, fmin, isfinite, isnan, rint
+from libc.math cimport INFINITY, fabs, fmax, fmin, isfinite, isnan, rint
 from libc.string cimport memcpy
 
 from fhaosmo_ros.core.model.prediction cimport MOST_LEVELS
@@ -21,6 +21,8 @@ from fhaosmo_ros.core.observer.status cimport (
 )
 from fhaosmo_ros.core.observer.structure cimport Estimate, Memory, MOST_INPUTS, Record, Structure
 from fhaosmo_ros.core.online.clock cimport FAR, WINDOW, Clock, clock_time, difference
+
+from collections import namedtuple
 
 import numpy as np
 
@@ -33,6 +35,8 @@ cdef int MOST_STEPS = 10_000
 cdef double MOST_INTERVALS = 500.0, FIRST_INTERVAL = 7.2e9
 GAP_SAMPLES = MOST_INTERVALS
 cdef double NANOSECONDS = 1e-9
+# Parameters that are settings as they are, in nanoseconds.
+TIMES = 'nominal_period', 'max_gap', 'stuck_time', 'divergence_time', 'measurement_delay'
 # Room for so many different values of the inputs within the delay; older ones are forgotten.
 cdef int MOST_PIECES = 512
 # A step of y is a multiple of another one up to this, and up to rounding of y to 32 bits.
@@ -64,12 +68,55 @@ cdef struct Settings:
     double epsilon  # y is lost while |eps_1| is larger (unit of y)
 
 
-cdef struct Counters:
-    # One for each case of docs/node.md; counters.py says what they mean.
-    long long accepted, rejected_measurements, rejected_spikes, rejected_stuck, rejected_steps
-    long long duplicate_stamps, backward_stamps, zero_stamps, far_stamps, rejected_inputs
-    long long gaps, sub_steps, spread_stamps, bursts, spikes_believed, stuck
-    long long restarts_forward, restarts_backward, divergences, jumps
+cdef struct Counts:
+    # What has happened to the samples, one number for each case of docs/node.md.
+    long long accepted  # samples used
+    # Samples that were not used:
+    long long rejected_measurements  # y was NaN, infinite or beyond 1e60
+    long long rejected_spikes  # y beyond spike_gate, or 6 usual deviations, from its prediction
+    long long rejected_stuck  # y unchanged for stuck_time, or repeated although it has noise
+    long long rejected_steps  # the step would have left the finite numbers
+    long long duplicate_stamps  # the stamp of the sample before (sampling = source_stamp)
+    long long backward_stamps  # older than the sample before, by at most max_gap: a late sample
+    long long zero_stamps  # no time yet: use_sim_time before the first /clock, an unset header
+    # More than max_gap from the stamp before: held until the next sample decides. Where that one
+    # confirms the jump, the observer starts from the held sample after all.
+    long long far_stamps
+    long long rejected_inputs  # u was NaN or infinite; the one before is held
+    long long gaps  # intervals of more than twice the mean that were bridged in sub-steps
+    long long sub_steps  # steps that these took
+    long long spread_stamps  # at the clock time of the one before (sampling = clock): spread
+    long long bursts  # samples within a tenth of the mean interval after the one before
+    long long spikes_believed  # five samples in a row were beyond the gate: a real step of y
+    long long stuck  # times that y began to be stuck
+    long long restarts_forward  # after a gap longer than max_gap, or a clock that jumped forward
+    long long restarts_backward  # after a clock that jumped back (bag loop, simulator reset)
+    long long divergences  # times that the observer had lost y and was restarted from it
+    long long jumps  # times that y alone jumped, and the other estimates went on (D 23, D 35)
+
+
+cdef Counts NOTHING
+cdef dict COUNTERS = NOTHING
+
+
+class Counters(namedtuple('Counters', COUNTERS)):
+    """
+    Numbers since the estimator was made, as `Counts` says; a snapshot.
+
+    A reset does not clear them.
+    """
+
+    __slots__ = ()
+
+    @property
+    def rejected(self):
+        """Samples of y that were not used."""
+        return sum(self[1:9])
+
+    @property
+    def restarts(self):
+        """Starts from a new sample after a gap or a jump of time."""
+        return self.restarts_forward + self.restarts_backward
 
 
 cdef struct Course:
@@ -89,7 +136,6 @@ cdef struct Course:
     long long intervals  # number of intervals in the mean
     double held_y
     double mean_interval  # running mean of dt (ns)
-    double mean_jitter  # running mean of its deviation (ns)
     double longest_mean  # longest mean_interval of late; a restart does not forget it (ns)
     int past_place  # of the latest piece of time with the same known inputs, in a ring of them
     int past_count  # of such pieces
@@ -114,23 +160,14 @@ cdef class Policy:
     """
     Takes time-stamped samples, and decides what each of them does to an observer.
 
-    Parameters
-    ----------
-    structure : Structure
-        The observer.
-    settings : dict
-        Values of `Settings`.
-
-    Notes
-    -----
     In a ``with`` statement a thread has it for itself: another one gets a RuntimeError.
-
     """
 
     cdef readonly Structure structure  # the observer
     cdef SelfTuning tuner  # the same, where it is self-tuning, else None
-    cdef readonly Settings settings
-    cdef public Counters counters
+    cdef object parameters
+    cdef Settings settings
+    cdef public Counts counters
     cdef readonly Course course
     cdef Clock clock
     cdef Sensor sensor
@@ -142,15 +179,30 @@ cdef class Policy:
     cdef unsigned long owner  # thread that has it for itself; 0: none
     cdef double acting[MOST_INPUTS]  # in the latest step; a mean where y is known later
 
-    def __cinit__(self, Structure structure not None, dict settings):
-        cdef int count = structure.inputs
+    def __cinit__(self, structure, parameters):
+        self.adopt(structure, parameters)
+        count, pieces = self.structure.inputs, MOST_PIECES * (self.settings.lag > 0)
         self.arrays = {
             'u': np.zeros(count), 'past_latest': np.zeros(count),
-            'past_pieces': np.zeros((MOST_PIECES * (settings['lag'] > 0), 1 + count)),
+            'past_pieces': np.zeros((pieces, 1 + count)),
         }
         self.held, self.present, self.pieces = self.arrays.values()
-        self.structure, self.settings = structure, settings
+
+    def adopt(self, Structure structure not None, parameters):
+        """Go on with an observer and parameters of the same sizes."""
+        p, late, c = parameters, parameters['measurement_delay'], structure.configuration
+        knows_noise = c.self_tuning or (c.levant and c.schedule is not None)
+        if self.parameters is not None and self.parameters['sampling'] != p['sampling']:
+            self.course.timed, self.clock.tick_count = False, 0  # stamps of another clock
+        self.structure, self.parameters = structure, parameters
         self.tuner = structure if isinstance(structure, SelfTuning) else None
+        times = {name: p[name] for name in TIMES}
+        times['lag'] = (late - p['input_delay']) * bool(c.model.used_inputs)
+        self.settings = {name: round(t / NANOSECONDS) for name, t in times.items()} | {
+            'nominal': p['sampling'] == 'nominal', 'by_clock': p['sampling'] == 'clock',
+            'to_now': p['predict_to_now'] and late > 0.0, 'gate': p['spike_gate'],
+            'epsilon': INFINITY if knows_noise else p['epsilon'],
+        }
 
     def __enter__(self):
         self.enter()
@@ -212,7 +264,7 @@ cdef class Policy:
 
     cdef void count(self, int word) noexcept nogil:
         """Count what has been done to a sample; times are counted where they are judged."""
-        cdef Counters* counters = &self.counters
+        cdef Counts* counters = &self.counters
         counters.accepted += not word & REJECTED
         counters.rejected_measurements += word & REJECTED_MEASUREMENT != 0
         counters.rejected_spikes += word & REJECTED_SPIKE != 0
@@ -411,7 +463,7 @@ cdef class Policy:
             self.structure.memory.gamma = gamma
         course.held = course.lost = False
         course.spikes = course.intervals = 0
-        course.mean_interval = course.mean_jitter = 0.0
+        course.mean_interval = 0.0
 
     # Steps
 
@@ -530,8 +582,6 @@ cdef class Policy:
         course.longest_mean = max(
             course.mean_interval, course.longest_mean * (1.0 - 1.0 / MOST_INTERVALS)
         )
-        if course.intervals > 1:
-            course.mean_jitter += (fabs(change) - course.mean_jitter) / course.intervals
 
     cdef bint has_diverged(self, bint failed, long long now) noexcept nogil:
         """Return True if the state is beyond all bounds, or y lost for divergence_time."""
@@ -669,7 +719,7 @@ cdef class Policy:
             array[:] = memory[name]
 
     def __reduce__(self):
-        return Policy, (self.structure, self.settings), (self.memory, self.counters)
+        return Policy, (self.structure, self.parameters), (self.memory, self.counters)
 
     def __setstate__(self, state):
         memory, self.counters = state
