@@ -223,6 +223,7 @@ cdef class Policy:
         """Take any stamp (ns) and y with the known inputs that are held; return a status word."""
         cdef Course* course = &self.course
         cdef Memory* memory = &self.structure.memory
+        cdef Counts* counters
         cdef long long now = stamp, elapsed = 0
         cdef int word
         if self.settings.nominal:
@@ -258,13 +259,8 @@ cdef class Policy:
             word |= self.structure.measure(
                 self.structure.level[0].z_hat if isnan(memory.y) else memory.y
             )
-        self.count(word)
         self.structure.word = word
-        return word
-
-    cdef void count(self, int word) noexcept nogil:
-        """Count what has been done to a sample; times are counted where they are judged."""
-        cdef Counts* counters = &self.counters
+        counters = &self.counters  # times are counted where they are judged
         counters.accepted += not word & REJECTED
         counters.rejected_measurements += word & REJECTED_MEASUREMENT != 0
         counters.rejected_spikes += word & REJECTED_SPIKE != 0
@@ -273,6 +269,7 @@ cdef class Policy:
         counters.gaps += word & GAP != 0
         counters.jumps += word & JUMPED != 0
         counters.divergences += word & DIVERGED != 0
+        return word
 
     cdef int judge(self, long long stamp, long long now, double y) noexcept nogil:
         """Return the flag that says why a sample is not used, whatever the observer is like."""
@@ -494,7 +491,7 @@ cdef class Policy:
         """
         Write the mean of the inputs over `elapsed` nanoseconds that ended the lag before now.
 
-        For the latest `elapsed` nanoseconds, which are no piece yet, they are those that are held.
+        For the latest `elapsed` nanoseconds, which are no piece yet, they are those held.
         """
         cdef long long lag = self.settings.lag, age = elapsed, younger, share
         cdef long long covered = max(elapsed - lag, 0)
