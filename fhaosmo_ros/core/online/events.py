@@ -107,7 +107,8 @@ class EventDetector:
 
     def __init__(self, parameters: Mapping[str, Any]) -> None:
         self.waiting: deque[Event] = deque(maxlen=10_000)
-        self.on, self.count, self.memory = False, 0, Progress()
+        self.on, self.count = False, 0
+        self.memory, self._change_time = Progress(), 0
         self.configure(parameters)
 
     @property
