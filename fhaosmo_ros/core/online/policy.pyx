@@ -69,30 +69,14 @@ cdef struct Settings:
 
 
 cdef struct Counts:
-    # What has happened to the samples, one number for each case of docs/node.md.
-    long long accepted  # samples used
-    # Samples that were not used:
-    long long rejected_measurements  # y was NaN, infinite or beyond 1e60
-    long long rejected_spikes  # y beyond spike_gate, or 6 usual deviations, from its prediction
-    long long rejected_stuck  # y unchanged for stuck_time, or repeated although it has noise
-    long long rejected_steps  # the step would have left the finite numbers
-    long long duplicate_stamps  # the stamp of the sample before (sampling = source_stamp)
-    long long backward_stamps  # older than the sample before, by at most max_gap: a late sample
-    long long zero_stamps  # no time yet: use_sim_time before the first /clock, an unset header
-    # More than max_gap from the stamp before: held until the next sample decides. Where that one
-    # confirms the jump, the observer starts from the held sample after all.
-    long long far_stamps
-    long long rejected_inputs  # u was NaN or infinite; the one before is held
-    long long gaps  # intervals of more than twice the mean that were bridged in sub-steps
-    long long sub_steps  # steps that these took
-    long long spread_stamps  # at the clock time of the one before (sampling = clock): spread
-    long long bursts  # samples within a tenth of the mean interval after the one before
-    long long spikes_believed  # five samples in a row were beyond the gate: a real step of y
-    long long stuck  # times that y began to be stuck
-    long long restarts_forward  # after a gap longer than max_gap, or a clock that jumped forward
-    long long restarts_backward  # after a clock that jumped back (bag loop, simulator reset)
-    long long divergences  # times that the observer had lost y and was restarted from it
-    long long jumps  # times that y alone jumped, and the other estimates went on (D 23, D 35)
+    # One number for each case of docs/node.md, in whose tables they are.
+    long long accepted
+    # Samples of y that were not used:
+    long long rejected_measurements, rejected_spikes, rejected_stuck, rejected_steps
+    long long duplicate_stamps, backward_stamps, zero_stamps, far_stamps
+    # What else has happened:
+    long long rejected_inputs, gaps, sub_steps, spread_stamps, bursts, spikes_believed, stuck
+    long long restarts_forward, restarts_backward, divergences, jumps
 
 
 cdef Counts NOTHING
@@ -101,9 +85,10 @@ cdef dict COUNTERS = NOTHING
 
 class Counters(namedtuple('Counters', COUNTERS)):
     """
-    Numbers since the estimator was made, as `Counts` says; a snapshot.
+    What has happened to the samples since the estimator was made; a reset does not clear them.
 
-    A reset does not clear them.
+    docs/node.md has the case of each number; those that were held back are counted as far stamps,
+    whatever the next sample decides.
     """
 
     __slots__ = ()
@@ -273,34 +258,32 @@ cdef class Policy:
 
     cdef int judge(self, long long stamp, long long now, double y) noexcept nogil:
         """Return the flag that says why a sample is not used, whatever the observer is like."""
+        cdef bint stuck
         if not fabs(y) <= LIMIT:  # also NaN
             return REJECTED_MEASUREMENT
         if stamp == 0 and not self.settings.nominal:
             self.counters.zero_stamps += 1
             return REJECTED_PERIOD
-        if self.settings.stuck_time and self.is_stuck(y - self.structure.memory.offset, now):
-            return REJECTED_STUCK
-        if self.tuner is None:
-            return 0
-        if self.is_held(y, now):
-            return REPEATED
-        return REJECTED_STUCK * self.repeats_noise(y)
+        stuck = self.settings.stuck_time and self.stands_still(y - self.structure.memory.offset, now)
+        if self.tuner is not None and not stuck:
+            if self.is_held(y, now):
+                return REPEATED
+            stuck = self.repeats_noise(y)
+        if stuck:
+            self.counters.stuck += not self.sensor.stuck
+            self.sensor.stuck = True
+        return REJECTED_STUCK * stuck
 
     # What a sample tells by itself: its time, and whether y can be true
 
-    cdef bint is_stuck(self, double y, long long now) noexcept nogil:
+    cdef bint stands_still(self, double y, long long now) noexcept nogil:
         """Return True if y has been seen unchanged for longer than stuck_time."""
         cdef Sensor* sensor = &self.sensor
         cdef long long silence = abs(difference(now, sensor.seen))
         sensor.seen = now
         if y != self.structure.memory.y or silence > self.max_gap():
             sensor.changed, sensor.stuck = now, False
-            return False
-        if difference(now, sensor.changed) <= self.settings.stuck_time:
-            return False
-        self.counters.stuck += not sensor.stuck
-        sensor.stuck = True
-        return True
+        return difference(now, sensor.changed) > self.settings.stuck_time
 
     cdef bint is_held(self, double y, long long now) noexcept nogil:
         """
@@ -351,12 +334,10 @@ cdef class Policy:
         cdef Sensor* sensor = &self.sensor
         if sensor.repeats <= CHANCE_REPEATS or y != sensor.sample:
             return False  # also of another y whose stamp is not later: `is_held` leaves that alone
-        if sensor.repeats == CHANCE_REPEATS + 1 and not sensor.stuck and (
-            sensor.elsewhere < RARELY and self.tuner.is_noisy(sensor.sample)
-        ):
-            sensor.stuck = True
-            self.counters.stuck += 1
-        return sensor.stuck
+        return sensor.stuck or (
+            sensor.repeats == CHANCE_REPEATS + 1
+            and sensor.elsewhere < RARELY and self.tuner.is_noisy(y)
+        )
 
     cdef bint is_spike(self, double innovation) noexcept nogil:
         """Return True if y is too far from its prediction to be believed yet."""
