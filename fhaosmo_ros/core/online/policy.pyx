@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-The policy of time and of bad data: one function for node, replay and trials.
-
-What it does, case by case, is in docs/node.md. Times are in nanoseconds.
+The policy of time and of bad data, case by case in docs/node.md. Times are in nanoseconds.
 
 A sample that arrives at t tells of the plant at t - `measurement_delay`; its stamp remains t for
 the rules of time. A known input that arrives at t acted at t - `input_delay`. So the step to a
@@ -264,7 +262,7 @@ cdef class Policy:
         if stamp == 0 and not self.settings.nominal:
             self.counters.zero_stamps += 1
             return REJECTED_PERIOD
-        stuck = self.settings.stuck_time and self.stands_still(y - self.structure.memory.offset, now)
+        stuck = self.settings.stuck_time > 0 and self.stands_still(y, now)
         if self.tuner is not None and not stuck:
             if self.is_held(y, now):
                 return REPEATED
@@ -279,9 +277,10 @@ cdef class Policy:
     cdef bint stands_still(self, double y, long long now) noexcept nogil:
         """Return True if y has been seen unchanged for longer than stuck_time."""
         cdef Sensor* sensor = &self.sensor
+        cdef Memory* memory = &self.structure.memory
         cdef long long silence = abs(difference(now, sensor.seen))
         sensor.seen = now
-        if y != self.structure.memory.y or silence > self.max_gap():
+        if y - memory.offset != memory.y or silence > self.max_gap():
             sensor.changed, sensor.stuck = now, False
         return difference(now, sensor.changed) > self.settings.stuck_time
 
@@ -328,8 +327,7 @@ cdef class Policy:
         """
         Return True if y repeats itself although it has noise; after `is_held`.
 
-        The sensor is stuck then, or at the end of its range: that y stands still is no motion.
-        Only for self-tuning, which knows whether y has noise, and is not quantised.
+        The sensor is stuck then, or at the end of its range. Only self-tuning knows the noise.
         """
         cdef Sensor* sensor = &self.sensor
         if sensor.repeats <= CHANCE_REPEATS or y != sensor.sample:
@@ -352,11 +350,7 @@ cdef class Policy:
     # Time
 
     cdef long long since_latest(self, long long now, double y, int* word) noexcept nogil:
-        """
-        Return the time (ns) to step over to a sample; add flags to `word`.
-
-        Where it is 0 and no flag rejects, the observer is fresh and the sample is its first.
-        """
+        """Return the time (ns) to step over to a sample, 0 to a first one; add flags to `word`."""
         cdef Course* course = &self.course
         cdef long long elapsed, follow, longest = self.max_gap()
         if not course.timed:  # the stamp is of another clock: it comes as usual
@@ -387,8 +381,7 @@ cdef class Policy:
             if course.late_count > MOST_INTERVALS:  # time does not catch up: a short bag loops
                 course.late_count = 0
                 word[0] = self.begin_again(False)
-            else:
-                self.counters.backward_stamps += 1
+            self.counters.backward_stamps += word[0] == REJECTED_PERIOD
             return 0
         if not course.held:
             course.held, course.held_stamp, course.held_y = True, now, y
@@ -469,24 +462,19 @@ cdef class Policy:
         latest[0] += elapsed
 
     cdef void find_acting(self, long long elapsed) noexcept nogil:
-        """
-        Write the mean of the inputs over `elapsed` nanoseconds that ended the lag before now.
-
-        For the latest `elapsed` nanoseconds, which are no piece yet, they are those held.
-        """
-        cdef long long lag = self.settings.lag, age = elapsed, younger, share
+        """Write the mean of the inputs over `elapsed` ns, no piece yet, that ended a lag ago."""
+        cdef long long lag = self.settings.lag, age = elapsed, share
         cdef long long covered = max(elapsed - lag, 0)
         cdef const double* piece
-        cdef int count = self.course.past_count, k, j
+        cdef int count = self.course.past_count, k = 0, j
         for j in range(self.structure.inputs):
             self.acting[j] = self.held[j] if covered > 0 or count == 0 else 0.0
-        for k in range(count):
-            if covered >= elapsed:
-                return
-            piece, younger = self.piece(k), age
+        while k < count and covered < elapsed:
+            piece = self.piece(k)
             age += <long long>piece[0]
-            share = min(age, lag + elapsed) - max(younger, lag)
-            if k == count - 1:  # the oldest one known stands for all before it
+            k += 1
+            share = min(age, lag + elapsed) - lag - covered
+            if k == count:  # the oldest one known stands for all before it
                 share = elapsed - covered
             if share > 0:
                 covered += share
@@ -505,11 +493,9 @@ cdef class Policy:
         cdef double mean = self.course.mean_interval, corrected = y - memory.offset
         cdef double gamma = memory.gamma, bend = 0.0, h, end, sample
         cdef int count = 1, word = 0, k
-        cdef bint is_gap, modelled = True
-        # After rejected samples it is none.
-        is_gap = self.course.intervals == WINDOW and memory.beyond == 0.0 and (
-            elapsed > GAP_RATIO * mean
-        )
+        cdef bint modelled = True, is_gap = elapsed > GAP_RATIO * mean
+        if self.course.intervals < WINDOW or memory.beyond > 0.0:  # after rejected samples
+            is_gap = False
         if is_gap and not self.structure.predicting:
             count = <int>fmin(elapsed / mean + 0.5, MOST_STEPS)
         h = elapsed * NANOSECONDS / count
@@ -550,10 +536,9 @@ cdef class Policy:
         """Take an interval into the running means; a gap can't do more than double them."""
         cdef Course* course = &self.course
         cdef double change = elapsed - course.mean_interval
-        if course.intervals < WINDOW:
-            course.intervals += 1
-        elif elapsed < 0.1 * course.mean_interval:
-            self.counters.bursts += 1
+        if course.intervals == WINDOW:
+            self.counters.bursts += elapsed < 0.1 * course.mean_interval
+        course.intervals = min(course.intervals + 1, WINDOW)
         if course.intervals == WINDOW:
             change = fmin(change, WINDOW * course.mean_interval)
         course.mean_interval += change / course.intervals
@@ -580,11 +565,7 @@ cdef class Policy:
         )
 
     cdef void carry(self, double* out) noexcept nogil:
-        """
-        Write z_1 .. z_n and d, (n + 1,), at present.
-
-        The model carries them over the delay, by the inputs that have acted since.
-        """
+        """Write z_1 .. z_n and d, (n + 1,), at present: the model carries them over the delay."""
         cdef double* z = self.structure.prediction.z
         cdef int i, k, n = self.structure.order, count = self.course.past_count, within = 0
         cdef long long lag = self.settings.lag, age = 0, older = lag
@@ -618,14 +599,14 @@ cdef class Policy:
 
     def run(self, const long long[::1] stamps, const double[::1] y, const double[:, ::1] u):
         """
-        Take K samples; return their record and arrays with a row for each of them.
+        Take K samples, their known inputs where finite; return their record and three arrays.
 
-        These are z and d where they are carried to the present (else there are no rows), times of
-        the observer, and the inputs that acted in the latest step until then. Instead of a known
-        input that is not finite the one before is held.
+        These have a row for each: z and d where they are carried to the present (else none), times
+        of the observer, and the inputs that acted in the latest step until then.
         """
         cdef Structure structure = self.structure
         cdef Py_ssize_t k, j, count = y.shape[0], m = structure.inputs
+        cdef long long behind
         cdef Record record = Record(structure, count)
         cdef double[:, ::1] present = np.empty((count * self.settings.to_now, structure.order + 1))
         cdef long long[::1] times = np.empty(count, dtype=np.int64)
@@ -645,9 +626,8 @@ cdef class Policy:
                     record.write(structure, k, self.take(stamps[k], y[k]))
                     if self.settings.to_now:
                         self.carry(&present[k, 0])
-                    times[k] = self.course.latest - <long long>(
-                        structure.memory.behind / NANOSECONDS
-                    )
+                    behind = <long long>(structure.memory.behind / NANOSECONDS)
+                    times[k] = self.course.latest - behind
                     memcpy(&acting[k, 0], self.acting, m * sizeof(double))
         finally:
             structure.busy = False
