@@ -46,12 +46,9 @@ class EstimatorNode(ManagedNode):
     """
     A managed node around one channel, or many, which share a timer and the typed messages.
 
-    configure makes the channels from the parameters; activate lets them take samples and publish;
-    deactivate stops that; cleanup destroys them, and then every parameter can be set, except the
-    names of the channels.
-
-    `given` are values of parameters, also of rclpy's own such as use_sim_time. Those that can't be
-    used raise ConfigurationError before anything is subscribed or published.
+    After cleanup every parameter can be set, except the names of the channels. `given` are values
+    of parameters, also of rclpy's own such as use_sim_time. Those that can't be used raise
+    ConfigurationError before anything is subscribed or published.
     """
 
     def __init__(self, given: Mapping[str, Any]) -> None:
@@ -108,12 +105,11 @@ class EstimatorNode(ManagedNode):
         latest = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self._parameters_topic = self.create_publisher(String, f'~/{PARAMETERS}', latest)
         if values[CHANNELS] == FROM_JOINTS:
-            self.sources.of(measured_output(values)).on_names = self._take_joints
+            source = self.sources.of(measured_output(values))
+            source.on_names = self._take_joints
             self.sources.open()
-            self.get_logger().info(
-                'channels from_joint_names: waiting for the first message on '
-                f'{self.resolve_topic_name(measured_output(values).topic)}'
-            )
+            said = f'waiting for the first message on {source.topic}'
+            self.get_logger().info(f'channels from_joint_names: {said}')
         else:
             self._open(channels)
         self._publish_parameters()
