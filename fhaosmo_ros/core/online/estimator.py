@@ -283,8 +283,7 @@ class OnlineEstimator:
         """Do what `update` does, of a stamp of 64 bits, and return only the status word."""
         if self.smoothing is None and not self.events.on:
             return self.policy.advance(stamp, y)  # type: ignore[no-any-return]
-        held = self.policy.arrays['u'][np.newaxis]
-        self._run(np.array([stamp]), np.array([y], dtype=np.float64), held)
+        self._run(np.array([stamp]), np.array([float(y)]), self.policy.arrays['u'][np.newaxis])
         return self.observer.structure.word  # type: ignore[no-any-return]
 
     def run(self, stamps: ArrayLike, y: ArrayLike, u: ArrayLike | None = None) -> Trajectory:
@@ -320,10 +319,8 @@ class OnlineEstimator:
             raise ConfigurationError(
                 f'run: expected stamps in nanoseconds, which are integers, got {stamps.dtype}'
             )
-        if u is None:
-            inputs = np.tile(self.policy.arrays['u'], (len(y), 1))
-        else:
-            inputs = known_inputs(u, self.observer.inputs, len(y))
+        u = np.tile(self.policy.arrays['u'], (len(y), 1)) if u is None else u
+        inputs = known_inputs(u, self.observer.inputs, len(y))
         return self._run(stamps.astype(np.int64, copy=False), y, inputs)
 
     def _run(self, stamps: NDArray[Any], y: NDArray[Any], u: NDArray[Any]) -> Trajectory:

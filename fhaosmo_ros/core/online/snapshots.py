@@ -27,12 +27,9 @@ INTEGER = 'integer'
 class Flag(IntFlag):
     """What happened at the sample of a snapshot."""
 
-    STARTED = 1
-    """The estimator was reset before this sample, or it is the first one."""
-    CHANGED = 2
-    """Parameters changed after it."""
-    RESET = 4
-    """The estimator was reset after it."""
+    STARTED = 1  # the estimator was reset before it, or it is the first one
+    CHANGED = 2  # parameters changed after it
+    RESET = 4  # the estimator was reset after it
 
 
 class Snapshot(NamedTuple):

@@ -6,6 +6,7 @@ from math import isfinite
 from time import perf_counter
 from typing import Any
 
+from diagnostic_msgs.msg import DiagnosticArray
 from fhaosmo_ros.core.observer.status import UNUSED
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.online.events import described
@@ -19,7 +20,8 @@ from fhaosmo_ros.nodes.estimator.sources import Listener
 from fhaosmo_ros.nodes.middleware.diagnostics import array_of, OK, QUIET, Report, WARN
 from fhaosmo_ros.nodes.middleware.endpoints import create_publisher, LATCHED, Listeners
 from fhaosmo_ros.nodes.middleware.messages import labelled, message_class, time_message
-from fhaosmo_ros.topics import ARRAY, DIAGNOSTICS, estimates_of, EVENT, SNAPSHOT
+from fhaosmo_ros.topics import estimates_of, EVENT, SNAPSHOT
+from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import SetBool, Trigger
 
 PERIOD, PERIOD_OF_SELF_TUNING = 1.0, 30.0
@@ -56,10 +58,9 @@ class Channel:
             name: create_publisher(node, message_class(kind), self.prefix + name)
             for name, kind in estimates_of(self.values).items()
         })  # fmt: skip
-        kind = message_class(DIAGNOSTICS)
-        self._events = create_publisher(node, kind, self.prefix + EVENT, latched=True)
-        kind = message_class(ARRAY)
-        self._snapshots = node.create_publisher(kind, self.prefix + SNAPSHOT, LATCHED)
+        self._events = create_publisher(node, DiagnosticArray, self.prefix + EVENT, latched=True)
+        topic = self.prefix + SNAPSHOT
+        self._snapshots = node.create_publisher(Float64MultiArray, topic, LATCHED)
         self._period = PERIOD_OF_SELF_TUNING if estimator.observer.self_tuning else PERIOD
         self._due = 0.0  # when the next snapshot is, by perf_counter
         self.pairing = Pairing(self.values, inputs, self.known, estimator.inputs)

@@ -15,13 +15,7 @@ from typing import Any
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.inputs import Input
 from fhaosmo_ros.messages.fields import Field, find_field, MissingElementError, Unwrapper
-from fhaosmo_ros.nodes.middleware.endpoints import (
-    full_name,
-    OVERRIDABLE,
-    SENSOR_QOS,
-    SequenceNumbers,
-    subscribe_with_info,
-)
+from fhaosmo_ros.nodes.middleware import endpoints
 from fhaosmo_ros.nodes.middleware.messages import definitions, message_class
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
@@ -78,38 +72,37 @@ class Source:
         self._node, self._sources, self.topic = node, sources, topic
         self.message_type = self._header = ''  # the latter: its name in a message
         self.heard, self.unheard = list[str](), list[str]()
-        self.numbers, self.offset = SequenceNumbers(), 0
+        self.numbers, self.offset = endpoints.SequenceNumbers(), 0
         self.delay = self._delay = -math.inf
         self.on_names: Callable[[Any], None] | None = None
         self.listeners, self._served = list[Listener](), list[Listener]()  # those with a field
         self._subscription: Any = None
 
     def open(self) -> bool:
-        """Subscribe if the type is known and has a field that is wanted; return whether."""
+        """Look for fields in the type, if it is known; return whether there is a subscription."""
         found = self._node.get_publishers_info_by_topic(self.topic)
         message_type = self.message_type or min((end.topic_type for end in found), default='')
         try:
-            return message_type != '' and self._take_type(message_type)
+            if message_type:
+                self._take_type(message_type)
         except (LookupError, RuntimeError) as error:  # not installed here; rcl's
             for listener in self.listeners:
                 listener.error = f'{self.topic}: {error}'
-            return False
+        return self._subscription is not None
 
-    def _take_type(self, message_type: str) -> bool:
-        """Find the fields in a message type; subscribe if there is one, and return whether."""
+    def _take_type(self, message_type: str) -> None:
+        """Find the fields in a message type, and subscribe if there is one."""
         kind, types = message_class(message_type), definitions(message_type)
         for listener in self.listeners:
             listener.find(types, message_type)
         self._served = [listener for listener in self.listeners if listener.field]
         self._header = next((li.field.header for li in self._served), '')
-        if not (self._served or self.on_names):
-            return False
-        self.message_type = message_type
-        self._subscription = subscribe_with_info(
-            self._node, kind, self.topic, self._on_message, copy(SENSOR_QOS),
-            qos_overriding_options=OVERRIDABLE,
-        )  # fmt: skip
-        return True
+        if self._subscription is None and (self._served or self.on_names):
+            self.message_type = message_type
+            self._subscription = endpoints.subscribe_with_info(
+                self._node, kind, self.topic, self._on_message, copy(endpoints.SENSOR_QOS),
+                qos_overriding_options=endpoints.OVERRIDABLE,
+            )  # fmt: skip
 
     def look(self) -> None:
         """Look at the topic's publishers in the ROS graph: QoS events do not name them."""
@@ -224,7 +217,7 @@ def find_wanted(types: Mapping[str, Any], wanted: Input, message_type: str) -> F
 def check_inputs(node: Node, inputs: Iterable[Input]) -> None:
     """Raise ConfigurationError for names, types or fields that cannot be, as far as given."""
     for wanted in inputs:
-        full_name(node, wanted.topic, "parameters 'input_topic', 'known_input_topics': ")
+        endpoints.full_name(node, wanted.topic, "parameters 'input_topic', 'known_input_topics': ")
         if wanted.message_type:
             try:
                 find_wanted(definitions(wanted.message_type), wanted, wanted.message_type)
