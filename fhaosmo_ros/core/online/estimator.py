@@ -36,9 +36,8 @@ class OnlineEstimator:
     An observer fed with time-stamped samples.
 
     Bad data does not raise and never makes an estimate that is not finite: it is rejected or
-    survived, counted, and told by the status word. The policy, case by case, is in
-    docs/node.md; it is compiled (policy.pyx). A second thread that uses one while it runs
-    gets a RuntimeError.
+    survived, counted, and told by the status word; docs/node.md says how, case by case. A second
+    thread that uses one while it runs gets a RuntimeError.
 
     Parameters
     ----------
@@ -351,11 +350,7 @@ class OnlineEstimator:
 
     @property
     def standard_deviation(self) -> NDArray[np.float64]:
-        """
-        Standard deviations of the errors of `estimate`: of z and d, (n + 1,).
-
-        As a self-tuning observer expects them; NaN with fixed gains.
-        """
+        """Those of the errors of `estimate`: z and d, (n + 1,); NaN with fixed gains."""
         return (self.smoothing or self.observer).standard_deviation
 
     @property

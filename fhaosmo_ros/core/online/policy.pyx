@@ -82,12 +82,7 @@ cdef dict COUNTERS = NOTHING
 
 
 class Counters(namedtuple('Counters', COUNTERS)):
-    """
-    What has happened to the samples since the estimator was made; a reset does not clear them.
-
-    docs/node.md has the case of each number; those that were held back are counted as far stamps,
-    whatever the next sample decides.
-    """
+    """What has happened to the samples so far, by docs/node.md; a reset does not clear them."""
 
     __slots__ = ()
 
@@ -206,7 +201,6 @@ cdef class Policy:
         """Take any stamp (ns) and y with the known inputs that are held; return a status word."""
         cdef Course* course = &self.course
         cdef Memory* memory = &self.structure.memory
-        cdef Counts* counters
         cdef long long now = stamp, elapsed = 0
         cdef int word
         if self.settings.nominal:
@@ -243,15 +237,14 @@ cdef class Policy:
                 self.structure.level[0].z_hat if isnan(memory.y) else memory.y
             )
         self.structure.word = word
-        counters = &self.counters  # times are counted where they are judged
-        counters.accepted += not word & REJECTED
-        counters.rejected_measurements += word & REJECTED_MEASUREMENT != 0
-        counters.rejected_spikes += word & REJECTED_SPIKE != 0
-        counters.rejected_stuck += word & REJECTED_STUCK != 0
-        counters.rejected_steps += word & REJECTED_STEP != 0
-        counters.gaps += word & GAP != 0
-        counters.jumps += word & JUMPED != 0
-        counters.divergences += word & DIVERGED != 0
+        self.counters.accepted += not word & REJECTED
+        self.counters.rejected_measurements += word & REJECTED_MEASUREMENT != 0
+        self.counters.rejected_spikes += word & REJECTED_SPIKE != 0
+        self.counters.rejected_stuck += word & REJECTED_STUCK != 0
+        self.counters.rejected_steps += word & REJECTED_STEP != 0
+        self.counters.gaps += word & GAP != 0
+        self.counters.jumps += word & JUMPED != 0
+        self.counters.divergences += word & DIVERGED != 0
         return word
 
     cdef int judge(self, long long stamp, long long now, double y) noexcept nogil:
@@ -290,8 +283,7 @@ cdef class Policy:
 
         Only for self-tuning, which would take every change after it for one of d. A sensor holds
         values if they change after as many samples as before, about, and not by multiples, as an
-        encoder's counts do. y may also really stand still: then it repeats itself for longer. What
-        is counted here serves `repeats_noise`, too.
+        encoder's counts do. Where y really stands still it repeats itself for longer.
         """
         cdef Sensor* sensor = &self.sensor
         cdef long long elapsed = difference(now, self.course.latest), usual = sensor.held_for
@@ -339,13 +331,13 @@ cdef class Policy:
 
     cdef bint is_spike(self, double innovation) noexcept nogil:
         """Return True if y is too far from its prediction to be believed yet."""
-        cdef bint too_far = not fabs(innovation) <= self.settings.gate
-        self.course.spikes = self.course.spikes + 1 if too_far else 0
-        if self.course.spikes > MOST_SPIKES:
+        self.course.spikes += 1
+        if fabs(innovation) <= self.settings.gate:
+            self.course.spikes = 0
+        elif self.course.spikes > MOST_SPIKES:
             self.course.spikes = 0
             self.counters.spikes_believed += 1
-            return False
-        return too_far
+        return self.course.spikes > 0
 
     # Time
 
@@ -485,9 +477,8 @@ cdef class Policy:
         """
         Step to a sample `elapsed` later, through a gap in sub-steps; return the status word.
 
-        In a gap the observer sees y as the model continues it from the last sample and the
-        internal estimates, plus a straight line that ends in the new sample. A scheme that
-        predicts follows the model by itself, so it takes a gap in one step.
+        In a gap the observer sees y as the model continues it, plus a straight line that ends in
+        the new sample. A scheme that predicts follows the model by itself, in one step.
         """
         cdef Memory* memory = &self.structure.memory
         cdef double mean = self.course.mean_interval, corrected = y - memory.offset
