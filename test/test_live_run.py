@@ -5,7 +5,7 @@ import re
 
 import bag_files as files
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
-from fhaosmo_ros.core.online.snapshots import Flag, pack, Snapshot
+from fhaosmo_ros.core.online.snapshots import Flag, pack
 from fhaosmo_ros.core.parameters.files import dumps
 from fhaosmo_ros.tools.bags.types import labelled_array
 from fhaosmo_ros.tools.replay import command as replay
@@ -41,7 +41,7 @@ class Live:
 
     def _tell(self, flags, delay):
         latest = self.estimator.latest
-        data = labelled_array(*pack(Snapshot(latest, flags, self.estimator.state_dict())))
+        data = labelled_array(*pack(flags, self.estimator.state_dict()))
         self.messages.append((f'{self.name}/snapshot', ARRAY, latest + delay, data))
 
     def tell_parameters(self, stamp, **values):

@@ -2,7 +2,7 @@
 """A node, a replay and one that goes on from a snapshot do the same, bit for bit."""
 
 from fhaosmo_ros.core import ConfigurationError, OnlineEstimator
-from fhaosmo_ros.core.online.snapshots import Flag, pack, Snapshot, unpack
+from fhaosmo_ros.core.online.snapshots import Flag, pack, unpack
 from hypothesis import given
 from hypothesis import strategies as st
 import numpy as np
@@ -77,7 +77,7 @@ def test_one_by_one_at_once_and_resumed_are_the_same(case):
     for k, now in enumerate(one_by_one(one, stamps, y, u)):
         np.testing.assert_array_equal(now, found[k])
         if k == 699:
-            labels, vector = pack(Snapshot(one.latest, Flag.CHANGED, one.state_dict()))
+            labels, vector = pack(Flag.CHANGED, one.state_dict())
             snapshot = unpack(vector.tolist(), labels)
             assert (snapshot.stamp, snapshot.flags) == (one.latest, Flag.CHANGED)
             resumed.run(stamps[:50], y[:50])  # whatever it was before
@@ -120,7 +120,7 @@ def test_gaps_jumps_and_bad_samples_are_the_same(samples, settings, sampling, si
     ]
     np.testing.assert_array_equal(np.concatenate(parts), rows)  # bit for bit
     assert events_of(one) == events_of(other)
-    for name in ('counters', 'period', 'jitter', 'stamp', 'inputs'):
+    for name in ('counters', 'period', 'stamp', 'inputs'):
         assert getattr(one, name) == getattr(other, name)
     np.testing.assert_equal(other.state_dict(), one.state_dict())
 
@@ -139,16 +139,20 @@ def test_labels_name_what_stands_there_and_integers_come_back_exactly(integer):
     estimator = fed(700)
     times = ('stamp', 'latest', 'now', 'held_stamp', 'seen', 'tick', 'placed', 'event_since')
     state = estimator.state_dict() | dict.fromkeys(times, integer)
-    labels, vector = pack(Snapshot(estimator.latest, Flag(0), state))
-    entries = dict(zip(labels, vector.tolist(), strict=True))
-    assert len(entries) == len(vector)  # no name twice
-    assert labels[0] == 'version'
-    assert entries['z_hat2'] == state['z_hat'][1]
-    assert int(entries['latest_upper']) * 2**32 + int(entries['latest_lower']) == integer
-    assert int(entries['sec']) * 10**9 + int(entries['nanosec']) == estimator.stamp
-    other = OnlineEstimator()
-    other.load_state_dict(unpack(vector, labels).values)
+    labels, vector = pack(Flag.RESET, state)
+    assert labels[:3] == ['version', 'z_hat:4', 'z_tilde:4']
+    assert {'latest:integer', 'covariance:4x4'} <= {*labels}
+    snapshot, other = unpack(vector, labels), OnlineEstimator()
+    assert (snapshot.stamp, snapshot.flags) == (integer, Flag.RESET)
+    other.load_state_dict(snapshot.values)
     np.testing.assert_equal(other.state_dict(), state)
+
+
+def test_what_an_estimator_remembers_has_names_of_its_own():
+    estimator = OnlineEstimator(gains='self_tuning', **SECOND)
+    own, events = estimator.policy.memory, vars(estimator.events.memory)
+    names = ['version', *estimator.observer.structure.state_dict(), *own, *events]
+    assert sorted(estimator.state_dict()) == sorted(names)
 
 
 LATE = {'gains': 'fixed', 'measurement_delay': 0.1, 'phi': ['u', '0', '0']}
@@ -171,21 +175,19 @@ def test_a_number_that_can_not_be_is_refused_and_changes_nothing(name, number):
 
 
 def test_snapshot_of_other_entries_or_sizes_is_refused():
-    labels, vector = pack(Snapshot(5, Flag(0), OnlineEstimator().state_dict()))
-    with pytest.raises(ConfigurationError, match='entries'):
-        unpack(np.zeros(8), labels)
-    swapped = list(labels)
-    k = swapped.index('z_hat1')
-    swapped[k : k + 2] = 'z_hat2', 'z_hat1'
-    for names in ([*labels[:-1], labels[0]], swapped):
-        with pytest.raises(ConfigurationError, match='entries'):
-            unpack(vector, names)
-    for names in ([], ['flags'], labels[4:]):
+    labels, vector = pack(Flag(0), OnlineEstimator().state_dict())
+    for entries, names in ([np.zeros(8), labels], [vector, [*labels[:-1], labels[0]]]):
+        with pytest.raises(ConfigurationError, match=r'entries|arrays'):
+            unpack(entries, names)
+    for names in ([], ['flags'], ['version'], ['y', 'z']):
         with pytest.raises(ConfigurationError, match='version'):
-            unpack(np.zeros(len(names)), names)
-    for name in ('z_hat9999999', 'z_hat6', 'z_hat0', 'covariance1', 'z_hat1_1'):
+            unpack(np.full(len(names), 8.0), names)
+    for name in ('y', 'w:9999999', 'w:2', 'w:n', 'w:-1x9', 'w:integer', 'w:1e3', 'w:9' * 99):
         with pytest.raises(ConfigurationError, match='snapshot'):
             unpack([*vector, 0.0], [*labels, name])
+    for number in np.nan, np.inf, -(2.0**33):
+        with pytest.raises(ConfigurationError, match=r"snapshot: (expected|'flags')"):
+            unpack([*vector[:-2], number, 0.0], labels)
     two = OnlineEstimator({'order': 2, 'phi': ['0', 'a - b'], 'inputs': ['a', 'b']}).state_dict()
     for other, said in (
         ({'order': 2, 'phi': ['0', 'u']}, 'expected finite numbers of shape'),

@@ -24,9 +24,8 @@ class PlantNode(BaseNode):
     """
     Publishes ``y``, ``~/state`` and ``~/unknown_input`` at `sample_rate`.
 
-    A plant that becomes unstable stays where it is: from the first value on that is not finite,
-    nothing is published, and an error is logged once. `given` are values of parameters, also of
-    rclpy's own such as use_sim_time; those that can't be used raise ConfigurationError.
+    `given` are values of parameters, also of rclpy's own such as use_sim_time; those that can't be
+    used raise ConfigurationError.
     """
 
     def __init__(self, given: Mapping[str, Any]) -> None:
@@ -56,9 +55,8 @@ class PlantNode(BaseNode):
         """
         Bring the simulation to the clock's present time and publish; y first.
 
-        The time between the clock's reading and the stamp of y acts as noise on y. So the long way
-        is integrated first; then the clock is read again for the little that is left, and nothing
-        else is done before y is out.
+        The time between the clock's reading and the stamp of y acts as noise on y, so the clock is
+        read again after the long way, for the little that is left.
         """
         clock = self.get_clock()
         self.plant.advance(self._plant_time(clock.now().nanoseconds), self._u)

@@ -42,8 +42,7 @@ class PrivateNode(Spinner):
     """
     A `node` in a context of its own, without signal handlers; spun while open.
 
-    `ros_arguments` are what launch gives to every node behind ``--ros-args``: names, remappings,
-    enclave.
+    `ros_arguments` are what launch gives each node: names, remappings, enclave.
     """
 
     def __init__(self, name: str, ros_arguments: Sequence[str] = ()) -> None:
@@ -60,15 +59,10 @@ class PrivateNode(Spinner):
 
     def set_parameters(self, node: str, values: Mapping[str, Any]) -> None:
         """Ask another node to change parameters; what it answers is not waited for."""
-        changes = [Parameter(name, value=value) for name, value in values.items()]
-        self._client(node).set_parameters(changes)
+        self._client(node).set_parameters([Parameter(k, value=v) for k, v in values.items()])
 
     def can_set_parameters(self, node: str) -> bool:
-        """
-        Return whether another node offers its parameters.
-
-        Asked early, it makes a client early: the first request of a new one can wait 3 s.
-        """
+        """Return whether a node offers its parameters; asked early, as clients may wait 3 s."""
         return bool(self._client(node).services_are_ready())
 
     def publisher(
@@ -86,29 +80,12 @@ class TopicRecorder(PrivateNode):
     """
     A node that records to a bag while it is open: topics as they appear, with their QoS.
 
-    Stamps are the messages' source time stamps, but see `OLD`.
+    Recorded are `topics`, and of `nodes` (full names) those below their names, whatever they
+    listen to, and `OF_NODES`; or `everything` that has a publisher. Stamps are the messages'
+    source time stamps, but see `OLD`. Nobody else may write to the bag meanwhile.
 
-    Parameters
-    ----------
-    bag : BagWriter
-        Nobody else may write to it meanwhile.
-    nodes : sequence of str
-        Full names of nodes whose topics to record: those below their names, whatever they listen
-        to, and `OF_NODES`.
-    topics : collection of str
-        Names of other topics.
-    everything : bool
-        Record every topic that has a publisher.
-    ros_arguments : sequence of str
-        See `PrivateNode`.
-
-    Attributes
-    ----------
-    counts : Counter of str
-        Messages by topic that have come.
-    problems : list of str
-        Lines that say why a topic can't be recorded, or not as a whole.
-
+    `counts` are the messages that have come, by topic; `problems` lines that say why a topic can't
+    be recorded, or not as a whole.
     """
 
     grace = None  # what is being written is written before the bag is closed
@@ -122,15 +99,13 @@ class TopicRecorder(PrivateNode):
         ros_arguments: Sequence[str] = (),
     ) -> None:
         super().__init__('fhaosmo_recorder', ros_arguments)
-        self.counts: Counter[str] = Counter()
-        self._numbers: dict[str, SequenceNumbers] = {}
-        self.problems: list[str] = []
-        self._bag, self._everything = bag, everything
+        self.counts, self.problems = Counter[str](), list[str]()
+        self._bag, self._everything, self._begin = bag, everything, time_ns()
         resolved = self.node.resolve_topic_name  # after remapping; names of nodes, too
-        self._nodes = [resolved(name) for name in nodes]
-        self._topics = {resolved(name) for name in [*topics, *(OF_NODES if nodes else ())]}
-        self._begin = time_ns()
-        self._seen: set[str] = set()
+        self._nodes = list(map(resolved, nodes))
+        self._topics = set(map(resolved, [*topics, *(OF_NODES if nodes else ())]))
+        self._seen = set[str]()
+        self._numbers = dict[str, SequenceNumbers]()  # of those that are recorded
 
     def __enter__(self) -> 'TopicRecorder':
         self._discover()
@@ -141,7 +116,7 @@ class TopicRecorder(PrivateNode):
 
     @property
     def lost(self) -> dict[str, int]:
-        """Messages that did not arrive, by topic; of topics with one publisher only."""
+        """Messages that did not arrive, by topic, of topics with one publisher."""
         return {topic: n.lost for topic, n in self._numbers.items() if n.single and n.lost}
 
     def check(self) -> None:
@@ -173,24 +148,22 @@ class TopicRecorder(PrivateNode):
                 continue
             publishers = self.node.get_publishers_info_by_topic(topic)
             profiles = [p.qos_profile for p in publishers if p.node_name != self.node.get_name()]
-            if not profiles:
-                continue
-            self._seen.add(topic)  # also if it can't be recorded
-            try:
-                kind = message_class(types[0])
-            except LookupError as error:
-                self.problems.append(f'not recorded: {topic}: {error}')
-                continue
-            offered = [_plain(p) for p in profiles]
-            different = [qos for k, qos in enumerate(offered) if qos not in offered[:k]]
-            if self._write(self._bag.add, topic, types[0], different) is False:
-                self.problems.append(f'{topic}: the bag will lack the definition of its type')
-            self._subscribe(topic, kind, profiles, measured=topic in inputs)
+            if profiles:
+                self._seen.add(topic)
+                try:
+                    self._record(topic, types[0], profiles, measured=topic in inputs)
+                except LookupError as error:
+                    self.problems.append(f'not recorded: {topic}: {error}')
 
-    def _subscribe(
-        self, topic: str, kind: Any, profiles: Sequence[QoSProfile], measured: bool
+    def _record(
+        self, topic: str, message_type: str, profiles: Sequence[QoSProfile], measured: bool
     ) -> None:
         """Record a topic with the strictest QoS that every publisher offers."""
+        kind = message_class(message_type)
+        offered = [_plain(p) for p in profiles]
+        different = [qos for k, qos in enumerate(offered) if qos not in offered[:k]]
+        if self._write(self._bag.add, topic, message_type, different) is False:
+            self.problems.append(f'{topic}: the bag will lack the definition of its type')
         qos = QoSProfile(depth=RECORDED_DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
         if all(p.reliability == ReliabilityPolicy.RELIABLE for p in profiles):
             qos.reliability = ReliabilityPolicy.RELIABLE
@@ -204,7 +177,7 @@ class TopicRecorder(PrivateNode):
         def receive(data: bytes, info: Mapping[str, int]) -> None:
             numbers.take(info)
             stamp = info['source_timestamp'] or info['received_timestamp']
-            stamp = stamp if stamp >= earliest else self._begin
+            stamp = self._begin if stamp < earliest else stamp
             self._write(self._bag.write, topic, stamp, data)
             self.counts[topic] += 1
 
@@ -213,14 +186,12 @@ class TopicRecorder(PrivateNode):
 
 def _plain(profile: QoSProfile) -> dict[str, Any]:
     """Return a QoS as bags describe it."""
-    names = {
-        name: getattr(profile, name).name.lower()
-        for name in ('history', 'reliability', 'durability', 'liveliness')
-    }
-    if not names['history'].startswith('keep'):
-        names['history'] = 'unknown'
-    times = {}
+    found: dict[str, Any] = {'depth': profile.depth, 'avoid_ros_namespace_conventions': False}
+    for name in ('history', 'reliability', 'durability', 'liveliness'):
+        found[name] = getattr(profile, name).name.lower()
+    if not found['history'].startswith('keep'):
+        found['history'] = 'unknown'
     for name in ('deadline', 'lifespan', 'liveliness_lease_duration'):
         seconds, nanoseconds = divmod(getattr(profile, name).nanoseconds, 1_000_000_000)
-        times[name] = {'sec': seconds, 'nsec': nanoseconds}
-    return {**names, **times, 'depth': profile.depth, 'avoid_ros_namespace_conventions': False}
+        found[name] = {'sec': seconds, 'nsec': nanoseconds}
+    return found

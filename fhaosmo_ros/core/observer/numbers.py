@@ -23,7 +23,7 @@ RANGES: dict[str, tuple[float, float]] = {
     'beyond': (0.0, math.inf),
     **dict.fromkeys(('spread', 'scale'), AT_LEAST_1),
     **dict.fromkeys(('spikes', 'tick_count', 'repeats', 'held_for'), COUNTS),
-    **dict.fromkeys(('mean_interval', 'mean_jitter', 'usual_interval'), COUNTS),
+    **dict.fromkeys(('mean_interval', 'longest_mean'), COUNTS),
     'intervals': (0, 32), 'regular': (0, 12), 'ticks': (-5000, 2**17), 'elsewhere': (0.0, 1.0),
     'event': (0, 5), 'event_deviation': (0.0, math.inf), 'past_place': (0, 511),
     'past_count': (0, 512),

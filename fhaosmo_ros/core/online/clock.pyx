@@ -40,11 +40,10 @@ cdef long long clock_time(
     """
     Return the time of a sample that came when the clock read `stamp`.
 
-    A clock that stands still between its ticks gives many samples one reading. A straight line is
-    fitted to the ticks by least squares with a growing memory (an alpha-beta filter), and times
-    follow it smoothly: a tick, or a sample, that comes late moves them by little, and a node that
-    stands for a moment does not move them. While there is no such line they are spread, and end
-    short of the next tick that is expected. `spread` counts samples that are put after a reading.
+    A straight line is fitted to the ticks by least squares with a growing memory (an alpha-beta
+    filter), and times follow it smoothly: a tick, or a sample, that comes late moves them by
+    little. While there is no line they are spread, and end short of the next tick that is
+    expected. `spread` counts samples that are put after a reading.
     """
     cdef double spacing = <double>clock.spacing / FINE
     cdef long long count = clock.tick_count, length = difference(stamp, clock.tick)

@@ -15,9 +15,8 @@ from fhaosmo_ros.core.observer.numbers import checked
 from fhaosmo_ros.core.observer.observer import Observer
 from fhaosmo_ros.core.observer.smoother import Smoother
 from fhaosmo_ros.core.observer.smoothing import Passes
-from fhaosmo_ros.core.online.counters import Counters
-from fhaosmo_ros.core.online.events import check_events, EventDetector, Progress
-from fhaosmo_ros.core.online.policy import Policy
+from fhaosmo_ros.core.online.events import EventDetector, Progress
+from fhaosmo_ros.core.online.policy import Counters, Policy
 from fhaosmo_ros.core.online.snapshots import VERSION
 from fhaosmo_ros.core.parameters.declaration import Parameters
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
@@ -30,8 +29,6 @@ NANOSECONDS = 1e-9
 SILENCE, SILENT_SAMPLES = 0.5, 5
 """Seconds, and usual intervals, after which y is said to be silent; the larger of both."""
 LARGEST_STAMP = 2**63 - 1
-TIMES = 'nominal_period', 'max_gap', 'stuck_time', 'divergence_time', 'measurement_delay'
-"""Parameters that the policy takes as they are, in nanoseconds."""
 
 
 class OnlineEstimator:
@@ -39,9 +36,8 @@ class OnlineEstimator:
     An observer fed with time-stamped samples.
 
     Bad data does not raise and never makes an estimate that is not finite: it is rejected or
-    survived, counted, and told by the status word. The policy, case by case, is in
-    docs/node.md; it is compiled (policy.pyx). A second thread that uses one while it runs
-    gets a RuntimeError.
+    survived, counted, and told by the status word; docs/node.md says how, case by case. A second
+    thread that uses one while it runs gets a RuntimeError.
 
     Parameters
     ----------
@@ -55,10 +51,6 @@ class OnlineEstimator:
     ----------
     observer : Observer
         To read parameters, sizes and state from; samples go through this class.
-    policy : Policy
-        What decides about samples; compiled functions step by it.
-    smoothing : Smoother or None
-        It has the estimates, where these are of the past.
     events : EventDetector
         Judges each estimate of d, as it is before any smoothing; `events.taken()` returns what has
         begun or ended since it was called last.
@@ -73,12 +65,10 @@ class OnlineEstimator:
     def __init__(self, parameters: Mapping[str, Any] | None = None, /, **named: Any) -> None:
         given = ESTIMATOR_PARAMETERS.complete(parameters, named)
         p = self._parameters = ONLINE_PARAMETERS.complete(given)
-        self.observer, smooths = Observer(p), p['smoothing_lag'] > 0.0
-        _check(p, self.observer.configuration, smooths)
-        self.smoothing: Smoother | None = None
-        if smooths:
-            self.smoothing = Smoother(self.observer, round(p['smoothing_lag'] / NANOSECONDS))
-        self.policy = Policy(self.observer.structure, self._settings(p))
+        self.observer, lag = Observer(p), round(p['smoothing_lag'] / NANOSECONDS)
+        _check(p, smooths=lag > 0)
+        self.smoothing = Smoother(self.observer, lag) if lag else None
+        self.policy = Policy(self.observer.structure, p)
         self.events = EventDetector(p)
 
     def __copy__(self) -> 'OnlineEstimator':
@@ -122,11 +112,6 @@ class OnlineEstimator:
         return float(self.policy.course['mean_interval'] * NANOSECONDS)
 
     @property
-    def jitter(self) -> float:
-        """Running mean of the intervals' distance from their mean, in seconds."""
-        return float(self.policy.course['mean_jitter'] * NANOSECONDS)
-
-    @property
     def offset(self) -> float:
         """What y is taken to be too large by, since a jump that the model contradicts (D 23)."""
         return float(self.observer.structure.memory['offset'])
@@ -135,7 +120,9 @@ class OnlineEstimator:
         """Return what follows from these changes; raise as `configure`, change nothing."""
         parameters = self._parameters.changed_live(changes, 'observer')
         configuration = ObserverConfiguration(parameters)
-        _check(parameters, configuration, self.smoothing is not None)
+        _check(parameters, smooths=self.smoothing is not None)
+        if self.smoothing is not None:
+            Passes(configuration)
         return parameters, configuration
 
     def configure(self, changes: Mapping[str, Any]) -> None:
@@ -150,28 +137,12 @@ class OnlineEstimator:
         """
         parameters, configuration = self.prepare(changes)
         with self.policy:
-            memory, counters = self.policy.memory, self.policy.counters
-            if parameters['sampling'] != self._parameters['sampling']:  # stamps of another clock
-                memory |= {'timed': False, 'tick_count': 0}
             self.observer.adopt(configuration)
             self.events.configure(parameters)
             if self.smoothing is not None:
                 self.smoothing.configure()
             self._parameters = parameters
-            self.policy = Policy(self.observer.structure, self._settings(parameters))
-            self.policy.__setstate__((memory, counters))
-
-    def _settings(self, p: Mapping[str, Any]) -> dict[str, Any]:
-        """Return what the policy reads of parameters; times in nanoseconds."""
-        c, late = self.observer.configuration, p['measurement_delay']
-        knows_noise = c.self_tuning or (c.levant and c.schedule is not None)
-        times = {name: p[name] for name in TIMES}
-        times['lag'] = (late - p['input_delay']) * bool(self.observer.used_inputs)
-        return {name: round(seconds / NANOSECONDS) for name, seconds in times.items()} | {
-            'nominal': p['sampling'] == 'nominal', 'by_clock': p['sampling'] == 'clock',
-            'to_now': p['predict_to_now'] and late > 0.0, 'gate': p['spike_gate'],
-            'epsilon': math.inf if knows_noise else p['epsilon'],
-        }  # fmt: skip
+            self.policy.adopt(self.observer.structure, parameters)
 
     @property
     def silence(self) -> float:
@@ -199,7 +170,7 @@ class OnlineEstimator:
             `noise_size` is 0, which says how much to trust a sample; or `predict_to_now`.
 
         """
-        _check(self._parameters, self.observer.configuration, smooths=True)
+        _check(self._parameters, smooths=True)
         self.smoothing = Smoother(self.observer)
 
     def finish(self) -> Trajectory:
@@ -223,18 +194,10 @@ class OnlineEstimator:
 
     def load_state_dict(self, values: Mapping[str, Any]) -> None:
         """
-        Go on where an estimator was; parameters and counters stay.
+        Go on where an estimator with the same model and delays was; parameters and counters stay.
 
-        Parameters
-        ----------
-        values : mapping
-            As `state_dict` returns them, of an estimator with the same model and delays.
-
-        Raises
-        ------
-        ConfigurationError
-            Something is missing, of another size, or out of its range. Then nothing has changed.
-
+        Raises ConfigurationError, and changes nothing, where something is missing, of another
+        size, or out of its range.
         """
         version = checked(values, {'version': VERSION})['version']
         if version != VERSION:
@@ -267,27 +230,22 @@ class OnlineEstimator:
         """The known inputs that are held, in the order of `Observer.inputs`."""
         return tuple(self.policy.arrays['u'].tolist())
 
-    def set_input(self, u: float, index: int = 0) -> bool:
+    def set_input(self, u: float, index: int = 0) -> None:
         """
         Hold a known input from now on.
 
         Parameters
         ----------
         u : float
+            If it is not finite, the one before is held, and this one counted.
         index : int
             Which one, in the order of `Observer.inputs`.
 
-        Returns
-        -------
-        bool
-            False if it is not finite: then the one before is held, and this one counted.
-
         """
-        if not math.isfinite(u):
+        if math.isfinite(u):
+            self.policy.arrays['u'][index] = u
+        else:
             self.reject_inputs(1)
-            return False
-        self.policy.arrays['u'][index] = u
-        return True
 
     def reject_inputs(self, count: int) -> None:
         """Count values of u that were not finite."""
@@ -324,8 +282,7 @@ class OnlineEstimator:
         """Do what `update` does, of a stamp of 64 bits, and return only the status word."""
         if self.smoothing is None and not self.events.on:
             return self.policy.advance(stamp, y)  # type: ignore[no-any-return]
-        held = self.policy.arrays['u'][np.newaxis]
-        self._run(np.array([stamp]), np.array([y], dtype=np.float64), held)
+        self._run(np.array([stamp]), np.array([float(y)]), self.policy.arrays['u'][np.newaxis])
         return self.observer.structure.word  # type: ignore[no-any-return]
 
     def run(self, stamps: ArrayLike, y: ArrayLike, u: ArrayLike | None = None) -> Trajectory:
@@ -361,10 +318,8 @@ class OnlineEstimator:
             raise ConfigurationError(
                 f'run: expected stamps in nanoseconds, which are integers, got {stamps.dtype}'
             )
-        if u is None:
-            inputs = np.tile(self.policy.arrays['u'], (len(y), 1))
-        else:
-            inputs = known_inputs(u, self.observer.inputs, len(y))
+        u = np.tile(self.policy.arrays['u'], (len(y), 1)) if u is None else u
+        inputs = known_inputs(u, self.observer.inputs, len(y))
         return self._run(stamps.astype(np.int64, copy=False), y, inputs)
 
     def _run(self, stamps: NDArray[Any], y: NDArray[Any], u: NDArray[Any]) -> Trajectory:
@@ -395,11 +350,7 @@ class OnlineEstimator:
 
     @property
     def standard_deviation(self) -> NDArray[np.float64]:
-        """
-        Standard deviations of the errors of `estimate`: of z and d, (n + 1,).
-
-        As a self-tuning observer expects them; NaN with fixed gains.
-        """
+        """Those of the errors of `estimate`: z and d, (n + 1,); NaN with fixed gains."""
         return (self.smoothing or self.observer).standard_deviation
 
     @property
@@ -410,18 +361,21 @@ class OnlineEstimator:
         return self.observer.tuning
 
 
-def _check(p: Mapping[str, Any], configuration: ObserverConfiguration, smooths: bool) -> None:
+def _check(p: Mapping[str, Any], smooths: bool) -> None:
     """Raise ConfigurationError where values do not fit together, also for who `smooths`."""
     if p['input_delay'] > p['measurement_delay']:
         raise ConfigurationError(
             "parameters 'input_delay', 'measurement_delay': expected each at most the next one, "
             f'got {p["input_delay"]} and {p["measurement_delay"]}'
         )
-    check_events(p)
+    if p['event_deviations'] and p['gains'] != 'self_tuning':
+        raise ConfigurationError(
+            "parameters 'event_deviations', 'gains': expected gains = 'self_tuning', which knows "
+            'the standard deviation of d, or event_deviations = 0 (event_threshold needs no '
+            f'standard deviation), got {p["event_deviations"]:g} and {p["gains"]!r}'
+        )
     if smooths and p['predict_to_now']:
         raise ConfigurationError(
             "smoothing, 'predict_to_now': expected estimates of the past or of the present, "
             'got both'
         )
-    if smooths:
-        Passes(configuration)

@@ -26,20 +26,15 @@ import math
 from typing import Any, NamedTuple
 
 from fhaosmo_ros.core.observer.status import AFRESH, UNUSED
-from fhaosmo_ros.core.parameters.errors import ConfigurationError
 import numpy as np
 from numpy.typing import ArrayLike
 
 SECOND = 1_000_000_000
 LONG = 1e9
 """Seconds that max_gap = 0 stands for."""
-MOST = 10_000
-"""Events that are kept until somebody takes them."""
 GROWTH, QUICKER = 800.0, 4.0
 """The lag of sigma in samples, with tuning_memory = 0; how much quicker while an event lasts."""
 EARLIEST = -(2**63)
-
-
 # What a detector does: it waits for a standard deviation; learns the mean; nothing is beyond the
 # limit; it is, not for long enough yet; an event lasts; the estimates of one were lost.
 FRESH, LEARNING, QUIET, BEYOND, ACTIVE, LOST = range(6)
@@ -104,7 +99,6 @@ class EventDetector:
         True if events are asked for.
     waiting : deque of Event
         Those that nobody has taken yet, at most the latest 10,000.
-    latest : Event or None
     count : int
         Events that have begun.
     memory : Progress
@@ -112,8 +106,7 @@ class EventDetector:
     """
 
     def __init__(self, parameters: Mapping[str, Any]) -> None:
-        self.waiting: deque[Event] = deque(maxlen=MOST)
-        self.latest: Event | None = None
+        self.waiting: deque[Event] = deque(maxlen=10_000)
         self.on, self.count = False, 0
         self.memory, self._change_time = Progress(), 0
         self.configure(parameters)
@@ -125,20 +118,19 @@ class EventDetector:
 
     def configure(self, parameters: Mapping[str, Any]) -> None:
         """Go on with other parameters; an event that lasts ends if none are asked for."""
-        change_time = round(parameters['event_change_time'] * SECOND)
-        if self.on and change_time != self._change_time:
+        p, was_on = parameters, self.on
+        change_time = round(p['event_change_time'] * SECOND)
+        if was_on and change_time != self._change_time:
             self.reset()
         self._change_time = change_time
-        self._duration = round(parameters['event_duration'] * SECOND)
-        self._growth = round(parameters['tuning_memory'] * SECOND)
-        self._max_gap = round((parameters['max_gap'] or LONG) * SECOND)
-        self._threshold, self._deviations, self._release = (
-            parameters[f'event_{name}'] for name in ('threshold', 'deviations', 'release')
-        )
-        on = self._threshold > 0.0 or self._deviations > 0.0
-        if self.on and not on:
-            self.memory.event, self.latest = FRESH, None
-        self.on = on
+        self._duration = round(p['event_duration'] * SECOND)
+        self._growth = round(p['tuning_memory'] * SECOND)
+        self._max_gap = round((p['max_gap'] or LONG) * SECOND)
+        self._threshold, self._deviations = p['event_threshold'], p['event_deviations']
+        self._release = p['event_release']
+        self.on = self._threshold > 0.0 or self._deviations > 0.0
+        if was_on and not self.on:
+            self.memory.event = FRESH
 
     def reset(self) -> None:
         """Expect estimates of a fresh observer: what was known of the mean does not count."""
@@ -169,21 +161,20 @@ class EventDetector:
 
         """
         zeros = np.zeros(np.size(d))
-        columns = [
-            stamps, stamps if times is None else times,
-            zeros.astype(int) if words is None else words, d,
-            zeros if deviations is None else deviations,
-        ]  # fmt: skip
-        rows = zip(*(np.asarray(column).tolist() for column in columns), strict=True)
+        times = stamps if times is None else times
+        words = zeros.astype(int) if words is None else words
+        sigmas = zeros if deviations is None else deviations
+        columns = map(np.asarray, (stamps, times, words, d, sigmas))
+        rows = zip(*(column.tolist() for column in columns), strict=True)
         for k, (stamp, time, word, value, deviation) in enumerate(rows):
             if word & UNUSED:
                 continue
             found = self._judge(stamp, time, word & AFRESH != 0, value, deviation)
             if found is not None:
-                known = math.nan if deviations is None else deviation
+                sigma = math.nan if deviations is None else deviation
                 begins = self.memory.event == ACTIVE
-                self.latest = Event(stamp, begins, self.memory.event_stamp, *found, known, k)
-                self.waiting.append(self.latest)
+                since = self.memory.event_stamp
+                self.waiting.append(Event(stamp, begins, since, *found, sigma, k))
                 self.count += begins
 
     def _judge(
@@ -251,27 +242,14 @@ class EventDetector:
 
 def described(event: Event, unit: str = '') -> tuple[str, dict[str, str]]:
     """Return an event in words, and its numbers by name, for messages."""
-    seconds = (event.stamp - event.since) * 1e-9
-    d = ' '.join(filter(None, (f'{event.value:.4g}', unit)))
+    seconds, (second, nanosecond) = event.stamp - event.since, divmod(event.since, SECOND)
+    text = f'ended after {seconds * 1e-9:.3g} s'
     if event.begins:
-        text = f'unknown input {d}, beyond {event.limit:.4g} for {seconds:.3g} s'
-    else:
-        text = f'ended after {seconds:.3g} s'
-    second, nanosecond = divmod(event.since, SECOND)
+        d = f'{event.value:.4g} {unit}'.rstrip()
+        text = f'unknown input {d}, beyond {event.limit:.4g} for {seconds * 1e-9:.3g} s'
     return text, {
         'value': f'{event.value:.9g}',
         'limit': f'{event.limit:.9g}',
         'standard deviation': f'{event.deviation:.9g}',
         'since': f'{second}.{nanosecond:09d}',
     }
-
-
-def check_events(parameters: Mapping[str, Any]) -> None:
-    """Raise ConfigurationError where standard deviations are asked for that nobody knows."""
-    k, gains = parameters['event_deviations'], parameters['gains']
-    if k and gains != 'self_tuning':
-        raise ConfigurationError(
-            "parameters 'event_deviations', 'gains': expected gains = 'self_tuning', which knows "
-            f'the standard deviation of d, or event_deviations = 0 (event_threshold needs no '
-            f'standard deviation), got {k:g} and {gains!r}'
-        )

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-The policy of time and of bad data: one function for node, replay and trials.
-
-What it does, case by case, is in docs/node.md. Times are in nanoseconds.
+The policy of time and of bad data, case by case in docs/node.md. Times are in nanoseconds.
 
 A sample that arrives at t tells of the plant at t - `measurement_delay`; its stamp remains t for
 the rules of time. A known input that arrives at t acted at t - `input_delay`. So the step to a
@@ -10,7 +8,7 @@ sample needs the inputs that arrived a lag of measurement_delay - input_delay be
 """
 
 from cpython.pythread cimport PyThread_get_thread_ident
-from libc.math cimport fabs, fmax, fmin, isfinite, isnan, rint
+from libc.math cimport INFINITY, fabs, fmax, fmin, isfinite, isnan, rint
 from libc.string cimport memcpy
 
 from fhaosmo_ros.core.model.prediction cimport MOST_LEVELS
@@ -21,6 +19,8 @@ from fhaosmo_ros.core.observer.status cimport (
 )
 from fhaosmo_ros.core.observer.structure cimport Estimate, Memory, MOST_INPUTS, Record, Structure
 from fhaosmo_ros.core.online.clock cimport FAR, WINDOW, Clock, clock_time, difference
+
+from collections import namedtuple
 
 import numpy as np
 
@@ -33,6 +33,8 @@ cdef int MOST_STEPS = 10_000
 cdef double MOST_INTERVALS = 500.0, FIRST_INTERVAL = 7.2e9
 GAP_SAMPLES = MOST_INTERVALS
 cdef double NANOSECONDS = 1e-9
+# Parameters that are settings as they are, in nanoseconds.
+TIMES = 'nominal_period', 'max_gap', 'stuck_time', 'divergence_time', 'measurement_delay'
 # Room for so many different values of the inputs within the delay; older ones are forgotten.
 cdef int MOST_PIECES = 512
 # A step of y is a multiple of another one up to this, and up to rounding of y to 32 bits.
@@ -64,12 +66,35 @@ cdef struct Settings:
     double epsilon  # y is lost while |eps_1| is larger (unit of y)
 
 
-cdef struct Counters:
-    # One for each case of docs/node.md; counters.py says what they mean.
-    long long accepted, rejected_measurements, rejected_spikes, rejected_stuck, rejected_steps
-    long long duplicate_stamps, backward_stamps, zero_stamps, far_stamps, rejected_inputs
-    long long gaps, sub_steps, spread_stamps, bursts, spikes_believed, stuck
+cdef struct Counts:
+    # One number for each case of docs/node.md, in whose tables they are.
+    long long accepted
+    # Samples of y that were not used:
+    long long rejected_measurements, rejected_spikes, rejected_stuck, rejected_steps
+    long long duplicate_stamps, backward_stamps, zero_stamps, far_stamps
+    # What else has happened:
+    long long rejected_inputs, gaps, sub_steps, spread_stamps, bursts, spikes_believed, stuck
     long long restarts_forward, restarts_backward, divergences, jumps
+
+
+cdef Counts NOTHING
+cdef dict COUNTERS = NOTHING
+
+
+class Counters(namedtuple('Counters', COUNTERS)):
+    """What has happened to the samples so far, by docs/node.md; a reset does not clear them."""
+
+    __slots__ = ()
+
+    @property
+    def rejected(self):
+        """Samples of y that were not used."""
+        return sum(self[1:9])
+
+    @property
+    def restarts(self):
+        """Starts from a new sample after a gap or a jump of time."""
+        return self.restarts_forward + self.restarts_backward
 
 
 cdef struct Course:
@@ -89,8 +114,7 @@ cdef struct Course:
     long long intervals  # number of intervals in the mean
     double held_y
     double mean_interval  # running mean of dt (ns)
-    double mean_jitter  # running mean of its deviation (ns)
-    double usual_interval  # longest mean_interval of late; a restart does not forget it (ns)
+    double longest_mean  # longest mean_interval of late; a restart does not forget it (ns)
     int past_place  # of the latest piece of time with the same known inputs, in a ring of them
     int past_count  # of such pieces
 
@@ -114,23 +138,14 @@ cdef class Policy:
     """
     Takes time-stamped samples, and decides what each of them does to an observer.
 
-    Parameters
-    ----------
-    structure : Structure
-        The observer.
-    settings : dict
-        Values of `Settings`.
-
-    Notes
-    -----
     In a ``with`` statement a thread has it for itself: another one gets a RuntimeError.
-
     """
 
     cdef readonly Structure structure  # the observer
     cdef SelfTuning tuner  # the same, where it is self-tuning, else None
-    cdef readonly Settings settings
-    cdef public Counters counters
+    cdef object parameters
+    cdef Settings settings
+    cdef public Counts counters
     cdef readonly Course course
     cdef Clock clock
     cdef Sensor sensor
@@ -142,15 +157,30 @@ cdef class Policy:
     cdef unsigned long owner  # thread that has it for itself; 0: none
     cdef double acting[MOST_INPUTS]  # in the latest step; a mean where y is known later
 
-    def __cinit__(self, Structure structure not None, dict settings):
-        cdef int count = structure.inputs
+    def __cinit__(self, structure, parameters):
+        self.adopt(structure, parameters)
+        count, pieces = self.structure.inputs, MOST_PIECES * (self.settings.lag > 0)
         self.arrays = {
             'u': np.zeros(count), 'past_latest': np.zeros(count),
-            'past_pieces': np.zeros((MOST_PIECES * (settings['lag'] > 0), 1 + count)),
+            'past_pieces': np.zeros((pieces, 1 + count)),
         }
         self.held, self.present, self.pieces = self.arrays.values()
-        self.structure, self.settings = structure, settings
+
+    def adopt(self, Structure structure not None, parameters):
+        """Go on with an observer and parameters of the same sizes."""
+        p, late, c = parameters, parameters['measurement_delay'], structure.configuration
+        knows_noise = c.self_tuning or (c.levant and c.schedule is not None)
+        if self.parameters is not None and self.parameters['sampling'] != p['sampling']:
+            self.course.timed, self.clock.tick_count = False, 0  # stamps of another clock
+        self.structure, self.parameters = structure, parameters
         self.tuner = structure if isinstance(structure, SelfTuning) else None
+        times = {name: p[name] for name in TIMES}
+        times['lag'] = (late - p['input_delay']) * bool(c.model.used_inputs)
+        self.settings = {name: round(t / NANOSECONDS) for name, t in times.items()} | {
+            'nominal': p['sampling'] == 'nominal', 'by_clock': p['sampling'] == 'clock',
+            'to_now': p['predict_to_now'] and late > 0.0, 'gate': p['spike_gate'],
+            'epsilon': INFINITY if knows_noise else p['epsilon'],
+        }
 
     def __enter__(self):
         self.enter()
@@ -206,52 +236,46 @@ cdef class Policy:
             word |= self.structure.measure(
                 self.structure.level[0].z_hat if isnan(memory.y) else memory.y
             )
-        self.count(word)
         self.structure.word = word
+        self.counters.accepted += not word & REJECTED
+        self.counters.rejected_measurements += word & REJECTED_MEASUREMENT != 0
+        self.counters.rejected_spikes += word & REJECTED_SPIKE != 0
+        self.counters.rejected_stuck += word & REJECTED_STUCK != 0
+        self.counters.rejected_steps += word & REJECTED_STEP != 0
+        self.counters.gaps += word & GAP != 0
+        self.counters.jumps += word & JUMPED != 0
+        self.counters.divergences += word & DIVERGED != 0
         return word
-
-    cdef void count(self, int word) noexcept nogil:
-        """Count what has been done to a sample; times are counted where they are judged."""
-        cdef Counters* counters = &self.counters
-        counters.accepted += not word & REJECTED
-        counters.rejected_measurements += word & REJECTED_MEASUREMENT != 0
-        counters.rejected_spikes += word & REJECTED_SPIKE != 0
-        counters.rejected_stuck += word & REJECTED_STUCK != 0
-        counters.rejected_steps += word & REJECTED_STEP != 0
-        counters.gaps += word & GAP != 0
-        counters.jumps += word & JUMPED != 0
-        counters.divergences += word & DIVERGED != 0
 
     cdef int judge(self, long long stamp, long long now, double y) noexcept nogil:
         """Return the flag that says why a sample is not used, whatever the observer is like."""
+        cdef bint stuck
         if not fabs(y) <= LIMIT:  # also NaN
             return REJECTED_MEASUREMENT
         if stamp == 0 and not self.settings.nominal:
             self.counters.zero_stamps += 1
             return REJECTED_PERIOD
-        if self.settings.stuck_time and self.is_stuck(y - self.structure.memory.offset, now):
-            return REJECTED_STUCK
-        if self.tuner is None:
-            return 0
-        if self.is_held(y, now):
-            return REPEATED
-        return REJECTED_STUCK * self.repeats_noise(y)
+        stuck = self.settings.stuck_time > 0 and self.stands_still(y, now)
+        if self.tuner is not None and not stuck:
+            if self.is_held(y, now):
+                return REPEATED
+            stuck = self.repeats_noise(y)
+        if stuck:
+            self.counters.stuck += not self.sensor.stuck
+            self.sensor.stuck = True
+        return REJECTED_STUCK * stuck
 
     # What a sample tells by itself: its time, and whether y can be true
 
-    cdef bint is_stuck(self, double y, long long now) noexcept nogil:
+    cdef bint stands_still(self, double y, long long now) noexcept nogil:
         """Return True if y has been seen unchanged for longer than stuck_time."""
         cdef Sensor* sensor = &self.sensor
+        cdef Memory* memory = &self.structure.memory
         cdef long long silence = abs(difference(now, sensor.seen))
         sensor.seen = now
-        if y != self.structure.memory.y or silence > self.max_gap():
+        if y - memory.offset != memory.y or silence > self.max_gap():
             sensor.changed, sensor.stuck = now, False
-            return False
-        if difference(now, sensor.changed) <= self.settings.stuck_time:
-            return False
-        self.counters.stuck += not sensor.stuck
-        sensor.stuck = True
-        return True
+        return difference(now, sensor.changed) > self.settings.stuck_time
 
     cdef bint is_held(self, double y, long long now) noexcept nogil:
         """
@@ -259,8 +283,7 @@ cdef class Policy:
 
         Only for self-tuning, which would take every change after it for one of d. A sensor holds
         values if they change after as many samples as before, about, and not by multiples, as an
-        encoder's counts do. y may also really stand still: then it repeats itself for longer. What
-        is counted here serves `repeats_noise`, too.
+        encoder's counts do. Where y really stands still it repeats itself for longer.
         """
         cdef Sensor* sensor = &self.sensor
         cdef long long elapsed = difference(now, self.course.latest), usual = sensor.held_for
@@ -296,37 +319,30 @@ cdef class Policy:
         """
         Return True if y repeats itself although it has noise; after `is_held`.
 
-        The sensor is stuck then, or at the end of its range: that y stands still is no motion.
-        Only for self-tuning, which knows whether y has noise, and is not quantised.
+        The sensor is stuck then, or at the end of its range. Only self-tuning knows the noise.
         """
         cdef Sensor* sensor = &self.sensor
         if sensor.repeats <= CHANCE_REPEATS or y != sensor.sample:
             return False  # also of another y whose stamp is not later: `is_held` leaves that alone
-        if sensor.repeats == CHANCE_REPEATS + 1 and not sensor.stuck and (
-            sensor.elsewhere < RARELY and self.tuner.is_noisy(sensor.sample)
-        ):
-            sensor.stuck = True
-            self.counters.stuck += 1
-        return sensor.stuck
+        return sensor.stuck or (
+            sensor.repeats == CHANCE_REPEATS + 1
+            and sensor.elsewhere < RARELY and self.tuner.is_noisy(y)
+        )
 
     cdef bint is_spike(self, double innovation) noexcept nogil:
         """Return True if y is too far from its prediction to be believed yet."""
-        cdef bint too_far = not fabs(innovation) <= self.settings.gate
-        self.course.spikes = self.course.spikes + 1 if too_far else 0
-        if self.course.spikes > MOST_SPIKES:
+        self.course.spikes += 1
+        if fabs(innovation) <= self.settings.gate:
+            self.course.spikes = 0
+        elif self.course.spikes > MOST_SPIKES:
             self.course.spikes = 0
             self.counters.spikes_believed += 1
-            return False
-        return too_far
+        return self.course.spikes > 0
 
     # Time
 
     cdef long long since_latest(self, long long now, double y, int* word) noexcept nogil:
-        """
-        Return the time (ns) to step over to a sample; add flags to `word`.
-
-        Where it is 0 and no flag rejects, the observer is fresh and the sample is its first.
-        """
+        """Return the time (ns) to step over to a sample, 0 to a first one; add flags to `word`."""
         cdef Course* course = &self.course
         cdef long long elapsed, follow, longest = self.max_gap()
         if not course.timed:  # the stamp is of another clock: it comes as usual
@@ -357,8 +373,7 @@ cdef class Policy:
             if course.late_count > MOST_INTERVALS:  # time does not catch up: a short bag loops
                 course.late_count = 0
                 word[0] = self.begin_again(False)
-            else:
-                self.counters.backward_stamps += 1
+            self.counters.backward_stamps += word[0] == REJECTED_PERIOD
             return 0
         if not course.held:
             course.held, course.held_stamp, course.held_y = True, now, y
@@ -368,17 +383,17 @@ cdef class Policy:
         word[0] = self.begin_again(elapsed > 0)
         follow = difference(now, course.held_stamp)
         if not 0 < follow <= longest:  # the rate is not known any more
-            course.usual_interval = 0.0
+            course.longest_mean = 0.0
             return 0
         if 0 < elapsed <= MOST_INTERVALS * FIRST_INTERVAL:  # the next one like this is none
-            course.usual_interval = max(course.usual_interval, 2.0 * elapsed / MOST_INTERVALS)
+            course.longest_mean = max(course.longest_mean, 2.0 * elapsed / MOST_INTERVALS)
         self.structure.start(course.held_y)
         course.latest = self.sensor.changed = course.held_stamp
         return follow
 
     cdef long long max_gap(self) noexcept nogil:
         """Return the longest interval that is stepped over (ns)."""
-        return self.longest(self.course.usual_interval or FIRST_INTERVAL)
+        return self.longest(self.course.longest_mean or FIRST_INTERVAL)
 
     cdef long long longest(self, double interval) noexcept nogil:
         """Return how far apart (ns) two stamps of one run may be, if intervals are such."""
@@ -411,7 +426,7 @@ cdef class Policy:
             self.structure.memory.gamma = gamma
         course.held = course.lost = False
         course.spikes = course.intervals = 0
-        course.mean_interval = course.mean_jitter = 0.0
+        course.mean_interval = 0.0
 
     # Steps
 
@@ -439,24 +454,19 @@ cdef class Policy:
         latest[0] += elapsed
 
     cdef void find_acting(self, long long elapsed) noexcept nogil:
-        """
-        Write the mean of the inputs over `elapsed` nanoseconds that ended the lag before now.
-
-        For the latest `elapsed` nanoseconds, which are no piece yet, they are those that are held.
-        """
-        cdef long long lag = self.settings.lag, age = elapsed, younger, share
+        """Write the mean of the inputs over `elapsed` ns, no piece yet, that ended a lag ago."""
+        cdef long long lag = self.settings.lag, age = elapsed, share
         cdef long long covered = max(elapsed - lag, 0)
         cdef const double* piece
-        cdef int count = self.course.past_count, k, j
+        cdef int count = self.course.past_count, k = 0, j
         for j in range(self.structure.inputs):
             self.acting[j] = self.held[j] if covered > 0 or count == 0 else 0.0
-        for k in range(count):
-            if covered >= elapsed:
-                return
-            piece, younger = self.piece(k), age
+        while k < count and covered < elapsed:
+            piece = self.piece(k)
             age += <long long>piece[0]
-            share = min(age, lag + elapsed) - max(younger, lag)
-            if k == count - 1:  # the oldest one known stands for all before it
+            k += 1
+            share = min(age, lag + elapsed) - lag - covered
+            if k == count:  # the oldest one known stands for all before it
                 share = elapsed - covered
             if share > 0:
                 covered += share
@@ -467,19 +477,16 @@ cdef class Policy:
         """
         Step to a sample `elapsed` later, through a gap in sub-steps; return the status word.
 
-        In a gap the observer sees y as the model continues it from the last sample and the
-        internal estimates, plus a straight line that ends in the new sample. A scheme that
-        predicts follows the model by itself, so it takes a gap in one step.
+        In a gap the observer sees y as the model continues it, plus a straight line that ends in
+        the new sample. A scheme that predicts follows the model by itself, in one step.
         """
         cdef Memory* memory = &self.structure.memory
         cdef double mean = self.course.mean_interval, corrected = y - memory.offset
         cdef double gamma = memory.gamma, bend = 0.0, h, end, sample
         cdef int count = 1, word = 0, k
-        cdef bint is_gap, modelled = True
-        # After rejected samples it is none.
-        is_gap = self.course.intervals == WINDOW and memory.beyond == 0.0 and (
-            elapsed > GAP_RATIO * mean
-        )
+        cdef bint modelled = True, is_gap = elapsed > GAP_RATIO * mean
+        if self.course.intervals < WINDOW or memory.beyond > 0.0:  # after rejected samples
+            is_gap = False
         if is_gap and not self.structure.predicting:
             count = <int>fmin(elapsed / mean + 0.5, MOST_STEPS)
         h = elapsed * NANOSECONDS / count
@@ -520,18 +527,15 @@ cdef class Policy:
         """Take an interval into the running means; a gap can't do more than double them."""
         cdef Course* course = &self.course
         cdef double change = elapsed - course.mean_interval
-        if course.intervals < WINDOW:
-            course.intervals += 1
-        elif elapsed < 0.1 * course.mean_interval:
-            self.counters.bursts += 1
+        if course.intervals == WINDOW:
+            self.counters.bursts += elapsed < 0.1 * course.mean_interval
+        course.intervals = min(course.intervals + 1, WINDOW)
         if course.intervals == WINDOW:
             change = fmin(change, WINDOW * course.mean_interval)
         course.mean_interval += change / course.intervals
-        course.usual_interval = max(
-            course.mean_interval, course.usual_interval * (1.0 - 1.0 / MOST_INTERVALS)
+        course.longest_mean = max(
+            course.mean_interval, course.longest_mean * (1.0 - 1.0 / MOST_INTERVALS)
         )
-        if course.intervals > 1:
-            course.mean_jitter += (fabs(change) - course.mean_jitter) / course.intervals
 
     cdef bint has_diverged(self, bint failed, long long now) noexcept nogil:
         """Return True if the state is beyond all bounds, or y lost for divergence_time."""
@@ -552,11 +556,7 @@ cdef class Policy:
         )
 
     cdef void carry(self, double* out) noexcept nogil:
-        """
-        Write z_1 .. z_n and d, (n + 1,), at present.
-
-        The model carries them over the delay, by the inputs that have acted since.
-        """
+        """Write z_1 .. z_n and d, (n + 1,), at present: the model carries them over the delay."""
         cdef double* z = self.structure.prediction.z
         cdef int i, k, n = self.structure.order, count = self.course.past_count, within = 0
         cdef long long lag = self.settings.lag, age = 0, older = lag
@@ -590,14 +590,14 @@ cdef class Policy:
 
     def run(self, const long long[::1] stamps, const double[::1] y, const double[:, ::1] u):
         """
-        Take K samples; return their record and arrays with a row for each of them.
+        Take K samples, their known inputs where finite; return their record and three arrays.
 
-        These are z and d where they are carried to the present (else there are no rows), times of
-        the observer, and the inputs that acted in the latest step until then. Instead of a known
-        input that is not finite the one before is held.
+        These have a row for each: z and d where they are carried to the present (else none), times
+        of the observer, and the inputs that acted in the latest step until then.
         """
         cdef Structure structure = self.structure
         cdef Py_ssize_t k, j, count = y.shape[0], m = structure.inputs
+        cdef long long behind
         cdef Record record = Record(structure, count)
         cdef double[:, ::1] present = np.empty((count * self.settings.to_now, structure.order + 1))
         cdef long long[::1] times = np.empty(count, dtype=np.int64)
@@ -617,9 +617,8 @@ cdef class Policy:
                     record.write(structure, k, self.take(stamps[k], y[k]))
                     if self.settings.to_now:
                         self.carry(&present[k, 0])
-                    times[k] = self.course.latest - <long long>(
-                        structure.memory.behind / NANOSECONDS
-                    )
+                    behind = <long long>(structure.memory.behind / NANOSECONDS)
+                    times[k] = self.course.latest - behind
                     memcpy(&acting[k, 0], self.acting, m * sizeof(double))
         finally:
             structure.busy = False
@@ -669,7 +668,7 @@ cdef class Policy:
             array[:] = memory[name]
 
     def __reduce__(self):
-        return Policy, (self.structure, self.settings), (self.memory, self.counters)
+        return Policy, (self.structure, self.parameters), (self.memory, self.counters)
 
     def __setstate__(self, state):
         memory, self.counters = state

@@ -2,40 +2,34 @@
 """
 What an estimator remembers as named numbers, and these as one labelled vector for a topic.
 
-In the vector an array has one entry for each of its numbers, labelled by the array's name and its
-index from 1 on, such as ``z_hat1`` or ``covariance1_2``. Integers of 64 bits (stamps) do not fit
-into a double: each has two entries, its upper and its lower half.
+The label of a number is its name, that of an array has the shape behind it, such as ``z_hat:4`` or
+``covariance:4x4``. Integers of 64 bits (stamps) do not fit into a double: such a one, labelled
+``stamp:integer``, has two entries, its upper and its lower half.
 """
 
 from collections.abc import Mapping, Sequence
 from enum import IntFlag
-from functools import lru_cache
+import math
 from numbers import Integral
-import re
 from typing import Any, NamedTuple
 
+from fhaosmo_ros.core.observer.numbers import checked
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-VERSION = 8
+VERSION = 9
 """Of the names."""
-HEAD = ['version', 'flags', 'sec', 'nanosec']
 HALF = 2**32
-SECOND = 1_000_000_000
-HALVES = ['_upper', '_lower']
-LABEL = re.compile(r'(.*?)(_upper|_lower|\d+(?:_\d+)*|)', re.DOTALL)
+INTEGER = 'integer'
 
 
 class Flag(IntFlag):
     """What happened at the sample of a snapshot."""
 
-    STARTED = 1
-    """The estimator was reset before this sample, or it is the first one."""
-    CHANGED = 2
-    """Parameters changed after it."""
-    RESET = 4
-    """The estimator was reset after it."""
+    STARTED = 1  # the estimator was reset before it, or it is the first one
+    CHANGED = 2  # parameters changed after it
+    RESET = 4  # the estimator was reset after it
 
 
 class Snapshot(NamedTuple):
@@ -46,29 +40,15 @@ class Snapshot(NamedTuple):
     values: dict[str, Any]  # as `OnlineEstimator.state_dict` returns them
 
 
-def pack(snapshot: Snapshot) -> tuple[list[str], NDArray[np.float64]]:
+def pack(flags: Flag, values: Mapping[str, Any]) -> tuple[list[str], NDArray[np.float64]]:
     """Return a snapshot as labels and a vector; the first entry is the version."""
-    values = {name: value for name, value in snapshot.values.items() if name != 'version'}
-    head = [VERSION, int(snapshot.flags), *divmod(snapshot.stamp, SECOND)]
-    parts = [
-        np.ravel(divmod(int(value), HALF) if isinstance(value, Integral) else value)
-        for value in values.values()
-    ]
-    return HEAD + _labels(values), np.concatenate([head, *parts], dtype=np.float64)
-
-
-def _labels(values: Mapping[str, Any]) -> list[str]:
-    """Return a label for each entry of named numbers."""
-    return _labels_of(tuple((k, np.shape(v), isinstance(v, Integral)) for k, v in values.items()))
-
-
-@lru_cache(maxsize=64)
-def _labels_of(shapes: tuple[tuple[str, tuple[int, ...], bool], ...]) -> list[str]:
-    labels = []
-    for name, shape, whole in shapes:
-        ends = ('_'.join(str(k + 1) for k in index) for index in np.ndindex(shape))
-        labels += [name + end for end in (HALVES if whole else ends)]
-    return labels
+    labels, parts = [], []
+    for name, value in {**values, 'version': float(VERSION), 'flags': int(flags)}.items():
+        whole = isinstance(value, Integral)
+        shape = INTEGER if whole else 'x'.join(map(str, np.shape(value)))
+        labels.append(f'{name}:{shape}' if shape else name)
+        parts.append(np.ravel(divmod(int(value), HALF) if whole else value))
+    return labels, np.concatenate(parts, dtype=np.float64)
 
 
 def unpack(vector: ArrayLike, labels: Sequence[str]) -> Snapshot:
@@ -81,37 +61,30 @@ def unpack(vector: ArrayLike, labels: Sequence[str]) -> Snapshot:
         The entries are not those of an estimator of this version.
 
     """
-    v = np.asarray(vector, dtype=np.float64)
-    if v.shape != (len(labels),) or len(set(labels)) < len(labels):
-        raise ConfigurationError(
-            f'snapshot: expected entries of as many names, got {v.size} of {len(set(labels))}'
-        )
-    entries = dict(zip(labels, v.tolist(), strict=True))
-    version, *head = (entries.pop(name, np.nan) for name in HEAD)
-    if version != VERSION or not np.all(np.abs(head) < HALF):
-        raise ConfigurationError(
-            f'snapshot: expected version {VERSION}, and a stamp, got version {version:g}'
-        )
-    flags, second, nanosecond = map(int, head)
-    parts: dict[str, dict[str, float]] = {}
-    for label, number in entries.items():
-        name, end = LABEL.fullmatch(label).groups()  # type: ignore[union-attr]  # all match
-        parts.setdefault(name, {})[end] = number
+    entries = np.ravel(np.asarray(vector, dtype=np.float64))
+    values: dict[str, Any] = {}
+    begin = 0
     try:
-        values = {name: _value(list(part), list(part.values())) for name, part in parts.items()}
+        for label in labels:
+            name, _, shape = label.partition(':')
+            sizes = [2] if shape == INTEGER else [int(size) for size in shape.split('x') if size]
+            begin, first = begin + math.prod(sizes), begin
+            values[name] = entries[first:begin].reshape(sizes)
+            if shape == INTEGER:
+                upper, lower = map(int, values[name])
+                values[name] = upper * HALF + lower
     except (OverflowError, ValueError) as error:
         raise ConfigurationError(
             f'snapshot: expected numbers and whole arrays ({error})'
         ) from None
-    if _labels(values) != list(entries):
-        raise ConfigurationError('snapshot: expected all entries of each array, in their order')
-    return Snapshot(second * SECOND + nanosecond, Flag(flags & 7), {'version': VERSION, **values})
-
-
-def _value(ends: list[str], numbers: list[float]) -> Any:
-    """Return what the entries of one name are, by the ends of their labels."""
-    if ends == ['']:
-        return numbers[0]
-    if ends == HALVES:
-        return int(numbers[0]) * HALF + int(numbers[1])
-    return np.reshape(numbers, [int(k) for k in ends[-1].split('_')])
+    if begin != entries.size or len(values) != len(labels):
+        raise ConfigurationError(
+            f'snapshot: expected {begin} entries of {len(labels)} names, got {entries.size} of '
+            f'{len(values)}'
+        )
+    version = values.pop('version', math.nan)
+    if not np.array_equal(version, VERSION):
+        raise ConfigurationError(f'snapshot: expected version {VERSION}, got version {version}')
+    head = checked(values, {'flags': 0, 'stamp': 0})
+    flags = Flag(head['flags'] & 7)
+    return Snapshot(head['stamp'], flags, {**values, 'version': VERSION})

@@ -6,21 +6,26 @@ from math import isfinite
 from time import perf_counter
 from typing import Any
 
+from diagnostic_msgs.msg import DiagnosticArray
 from fhaosmo_ros.core.observer.status import UNUSED
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.online.events import described
-from fhaosmo_ros.core.online.snapshots import Flag
+from fhaosmo_ros.core.online.snapshots import Flag, pack
 from fhaosmo_ros.core.parameters.declaration import Parameters
 from fhaosmo_ros.core.parameters.units import derivative_unit
 from fhaosmo_ros.inputs import known_inputs, measured_output, Pairing
 from fhaosmo_ros.nodes.estimator.health import Health
-from fhaosmo_ros.nodes.estimator.outputs import Outputs
+from fhaosmo_ros.nodes.estimator.outputs import estimate_messages
 from fhaosmo_ros.nodes.estimator.sources import Listener
 from fhaosmo_ros.nodes.middleware.diagnostics import array_of, OK, QUIET, Report, WARN
-from fhaosmo_ros.nodes.middleware.endpoints import create_publisher
-from fhaosmo_ros.nodes.middleware.messages import message_class, time_message
-from fhaosmo_ros.topics import DIAGNOSTICS, EVENT
+from fhaosmo_ros.nodes.middleware.endpoints import create_publisher, LATCHED, Listeners
+from fhaosmo_ros.nodes.middleware.messages import labelled, message_class, time_message
+from fhaosmo_ros.topics import estimates_of, EVENT, SNAPSHOT
+from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import SetBool, Trigger
+
+PERIOD, PERIOD_OF_SELF_TUNING = 1.0, 30.0
+"""Seconds between two snapshots; a self-tuning estimator remembers hundreds of numbers."""
 
 
 class Channel:
@@ -31,6 +36,9 @@ class Channel:
     and nothing is published. `name` is in its topics, services, reports and log, '' without names;
     topics begin with `prefix`. The `node` has the `sources` and the `typed` outputs that its
     channels share. `measured` and `known` say what y and the known inputs are.
+
+    Messages that nobody hears are not made: one costs more than a step with fixed gains. By the
+    snapshots a replay follows the estimator.
     """
 
     def __init__(self, node: Any, values: Parameters, name: str = '') -> None:
@@ -45,9 +53,16 @@ class Channel:
     def open(self) -> None:
         """Make its topics, and listen to y and to the known inputs."""
         node, estimator, inputs = self._node, self.estimator, self.estimator.observer.inputs
-        self._outputs = Outputs(node, self.prefix, estimator)
-        kind = message_class(DIAGNOSTICS)
-        self._events = create_publisher(node, kind, self.prefix + EVENT, latched=True)
+        self._messages = estimate_messages(estimator)
+        self._listeners = Listeners({
+            name: create_publisher(node, message_class(kind), self.prefix + name)
+            for name, kind in estimates_of(self.values).items()
+        })  # fmt: skip
+        self._events = create_publisher(node, DiagnosticArray, self.prefix + EVENT, latched=True)
+        topic = self.prefix + SNAPSHOT
+        self._snapshots = node.create_publisher(Float64MultiArray, topic, LATCHED)
+        self._period = PERIOD_OF_SELF_TUNING if estimator.observer.self_tuning else PERIOD
+        self._due = 0.0  # when the next snapshot is, by perf_counter
         self.pairing = Pairing(self.values, inputs, self.known, estimator.inputs)
         self.u: dict[str, Listener] = {}
         for u, its in self.known.items():
@@ -80,7 +95,7 @@ class Channel:
     def adopt(self, values: Parameters) -> None:
         """Go on with other live parameters."""
         self.estimator.configure(values)
-        self._outputs.snapshot(Flag.CHANGED)
+        self._tell_snapshot(Flag.CHANGED)
         self.values = values
 
     def _on_input(self, index: int, stamp: int, u: float) -> None:
@@ -121,8 +136,8 @@ class Channel:
             health.stamps.append(stamp)
             health.stepping += now - begin
             health.d.append(estimator.observer.estimate.unknown_input)
-            if now >= self._outputs.due:
-                self._outputs.snapshot(Flag(0) if self._outputs.due else Flag.STARTED)
+            if now >= self._due:
+                self._tell_snapshot(Flag(0) if self._due else Flag.STARTED)
             if self.values['publish_on'] == 'sample':
                 self._publish()
 
@@ -130,7 +145,8 @@ class Channel:
         """Publish the latest estimate, in the typed messages together with other channels'."""
         estimate, stamp = self.estimator.estimate, self.estimator.stamp
         if estimate is not None:
-            self._outputs.publish(estimate, stamp)
+            for name, publisher in self._listeners.heard().items():
+                publisher.publish(self._messages[name](estimate, stamp))
             name = self.name or (self.y.field and self.y.field.key) or 'y'
             self._node.typed.add(name, (stamp, estimate, self.values))
 
@@ -151,6 +167,13 @@ class Channel:
         if not self.stale and self.values['publish_on'] == 'timer':
             self._publish()
 
+    def _tell_snapshot(self, flags: Flag) -> None:
+        """Publish what the estimator remembers, and what has happened at the latest sample."""
+        if self.estimator.latest is not None:
+            labels, vector = pack(flags, self.estimator.state_dict())
+            self._snapshots.publish(labelled(labels)(vector))
+            self._due = 0.0 if flags == Flag.RESET else perf_counter() + self._period
+
     def _tell_events(self) -> None:
         """Publish, and log, the events that have begun or ended."""
         unit = derivative_unit(self.values['measurement_unit'], self.estimator.observer.order)
@@ -169,11 +192,11 @@ class Channel:
     def reset(self, _: Trigger.Request | None = None) -> str:
         """Start the observer afresh with the next sample; return what has been done."""
         self.estimator.reset()
-        self._outputs.snapshot(Flag.RESET)
+        self._tell_snapshot(Flag.RESET)
         return 'the observer starts afresh with the next sample'
 
     def freeze(self, request: SetBool.Request) -> str:
         """Hold gamma, or let it adapt again; return what has been done."""
         self.estimator.freeze(request.data)
-        self._outputs.snapshot(Flag.CHANGED)
+        self._tell_snapshot(Flag.CHANGED)
         return 'gamma is held' if request.data else 'gamma adapts again'

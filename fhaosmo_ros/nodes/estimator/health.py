@@ -17,12 +17,11 @@ WINDOW = 5
 NANOSECONDS = 1e-9
 BAD_SHARE = 0.5
 """Share of samples lost or rejected that is an error; any at all deserves a warning."""
-GAMMA_AWAY = 0.2
-"""Distance of gamma from where it began that deserves a warning."""
-RATE_RATIO = 1.5
-"""Factor between the rate of y and that of the gains that deserves one."""
-SPREAD = 3.0
-"""Factor between the innovations and those expected that deserves one."""
+GAMMA_AWAY, RATE_RATIO, SPREAD = 0.2, 1.5, 3.0
+"""
+What deserves one, too: a distance of gamma from where it began, a factor between the rate of y and
+that of the gains, and one between the innovations and those expected.
+"""
 UNUSED = {
     'samples lost': '{n} samples lost: they did not arrive, or were damaged',
     'rejected measurements': '{n} samples rejected: y was NaN, infinite or beyond 1e60',
@@ -60,10 +59,10 @@ HOST_TIME = (
 
 class Health:
     """
-    Remembers a few numbers of each sample of a `Channel`, and makes two reports of them.
+    Makes two reports of the samples of a `Channel`.
 
-    Of each sample that was used they are its stamp (ns) and d. `latest` is the time of the last
-    one on `perf_counter`, `stepping` how long the steps took in all (s).
+    It remembers stamp (ns) and d of each sample that was used, as `latest` when the last one came,
+    on `perf_counter`, and as `stepping` how long the steps took in all (s).
     """
 
     def __init__(self, channel: Any) -> None:
@@ -105,24 +104,21 @@ class Health:
         self.stepping = 0.0
         return reports
 
-    def _report(self, task: str, values: Mapping[str, Any]) -> Report:
-        return Report(f'{self._channel.name} {task}'.lstrip(), values)
-
     def _input(self, news: Mapping[str, int], period: float, jitter: float) -> Report:
         """Report on the samples; `news` is by how much each counter has grown."""
         channel, y, limits = self._channel, self._channel.y, self._channel.values
-        source, heard = y.source, y.source.heard
+        source, heard, names = y.source, y.source.heard, ', '.join(sorted(y.source.heard))
         rate = 1.0 / period if period > 0.0 else nan
         delay = source.delay * NANOSECONDS if source.delay > -inf else nan
         offset = source.offset * NANOSECONDS if y.stamps == 'header' else 0.0
         age = perf_counter() - self.latest
         stamps = 'clock' if limits['sampling'] == 'clock' else y.stamps
-        report = self._report('input', {
+        report = Report(f'{channel.name} input'.lstrip(), {
             'topic': source.topic,
             'type': source.message_type or 'not known yet',
             'field': y.field.text if y.field else 'not known yet',
             'stamps': stamps or 'not known yet',
-            'publishers': ', '.join(sorted(heard)) or 'none',
+            'publishers': names or 'none',
             'sample rate [Hz]': rate,
             'jitter (std / mean of the period)': jitter,
             'longest delay [s]': delay,
@@ -138,7 +134,7 @@ class Health:
         alone = f'no publisher of {source.topic} that can be heard'
         report.find(silence, alone, not heard and not y.error)
         used, lacking = news['samples accepted'], news['messages without y']
-        several = f'{len(heard)} publishers, their samples mix: {", ".join(sorted(heard))}'
+        several = f'{len(heard)} publishers, their samples mix: {names}'
         report.find(WARN, several, len(heard) > 1 and not lacking)
         report.find(WARN, f'{lacking} messages without y: {y.why}', lacking and not used)
         bad = sum(news[key] for key in UNUSED)
@@ -178,7 +174,7 @@ class Health:
         past, step = np.array(self.d), self.stepping / max(1, len(self.d))
         deviation = float(np.std(past)) if len(past) else nan
         index = min(1.0, high_passed(past, WINDOW) / deviation) if deviation > 0.0 else 0.0
-        report = self._report('observer', {
+        report = Report(f'{channel.name} observer'.lstrip(), {
             'open levels': f'{levels} of {observer.levels}',
             'gamma': gamma,
             'gamma is held by ~/freeze': estimator.frozen,

@@ -6,32 +6,19 @@ from contextlib import contextmanager, suppress
 from functools import partial
 from typing import Any
 
+from fhaosmo_ros.core.parameters import per_channel
 from fhaosmo_ros.core.parameters.declaration import Parameters, Value
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.files import complete
-from fhaosmo_ros.core.parameters.per_channel import (
-    channel_names,
-    CHANNELS,
-    FROM_JOINTS,
-    of_channel,
-    split,
-    with_own_parameters,
-)
+from fhaosmo_ros.core.parameters.per_channel import CHANNELS, FROM_JOINTS, of_channel
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
 from fhaosmo_ros.inputs import measured_output, with_joints
 from fhaosmo_ros.messages.fields import listed
 from fhaosmo_ros.nodes.estimator.channel import Channel
 from fhaosmo_ros.nodes.estimator.outputs import parameter_text, TypedOutputs
 from fhaosmo_ros.nodes.estimator.sources import check_inputs, Sources
-from fhaosmo_ros.nodes.middleware.diagnostics import (
-    ERROR,
-    OK,
-    publish_diagnostics,
-    Report,
-    ReportLog,
-    STALE,
-    WARN,
-)
+from fhaosmo_ros.nodes.middleware import diagnostics
+from fhaosmo_ros.nodes.middleware.diagnostics import ERROR, OK, Report, STALE, WARN
 from fhaosmo_ros.nodes.middleware.endpoints import check_overrides, full_name, set_period
 from fhaosmo_ros.nodes.middleware.lifecycle import ManagedNode
 from fhaosmo_ros.nodes.middleware.spin import run_node
@@ -46,12 +33,9 @@ class EstimatorNode(ManagedNode):
     """
     A managed node around one channel, or many, which share a timer and the typed messages.
 
-    configure makes the channels from the parameters; activate lets them take samples and publish;
-    deactivate stops that; cleanup destroys them, and then every parameter can be set, except the
-    names of the channels.
-
-    `given` are values of parameters, also of rclpy's own such as use_sim_time. Those that can't be
-    used raise ConfigurationError before anything is subscribed or published.
+    After cleanup every parameter can be set, except the names of the channels. `given` are values
+    of parameters, also of rclpy's own such as use_sim_time. Those that can't be used raise
+    ConfigurationError before anything is subscribed or published.
     """
 
     def __init__(self, given: Mapping[str, Any]) -> None:
@@ -66,7 +50,7 @@ class EstimatorNode(ManagedNode):
         self._left_out: list[str] = []  # what is said of those that are no channels
         self._channels: list[Channel] = []  # none before the names of the joints are known
         self._parameters_topic: Any = None
-        self._diagnostics = publish_diagnostics(self, self._reports)
+        self._diagnostics = diagnostics.publish_diagnostics(self, self._reports)
         try:
             if values['autostart']:
                 self.start()
@@ -82,7 +66,7 @@ class EstimatorNode(ManagedNode):
         values = self.values
         names: list[str] = values[CHANNELS]
         if names == FROM_JOINTS:  # which joints there are is not known yet, but some may be named
-            names = [*names, *with_own_parameters(names, values)]
+            names = [*names, *per_channel.with_own_parameters(names, values)]
         channels, inputs, estimates = [], [], []
         for name in names:
             with naming_channel(name):
@@ -108,12 +92,11 @@ class EstimatorNode(ManagedNode):
         latest = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self._parameters_topic = self.create_publisher(String, f'~/{PARAMETERS}', latest)
         if values[CHANNELS] == FROM_JOINTS:
-            self.sources.of(measured_output(values)).on_names = self._take_joints
+            source = self.sources.of(measured_output(values))
+            source.on_names = self._take_joints
             self.sources.open()
-            self.get_logger().info(
-                'channels from_joint_names: waiting for the first message on '
-                f'{self.resolve_topic_name(measured_output(values).topic)}'
-            )
+            said = f'waiting for the first message on {source.topic}'
+            self.get_logger().info(f'channels from_joint_names: {said}')
         else:
             self._open(channels)
         self._publish_parameters()
@@ -159,8 +142,9 @@ class EstimatorNode(ManagedNode):
             self._left_out.append(left_out(new, 'not in the first message'))
             return
         most = present['max_channels']
-        fit = self._fitting(names)
-        bad = [name for name in dict.fromkeys(names) if name not in fit]
+        fit, bad = [], []
+        for name in dict.fromkeys(names):
+            (fit if self._fits(name) else bad).append(name)
         hint = 'name a channel, and set its input_field to position[NAME]'
         self._left_out = [
             left_out(bad, f"can't be the name of a channel; {hint}"),
@@ -169,10 +153,10 @@ class EstimatorNode(ManagedNode):
         fit = fit[:most]
         if not fit:
             return
-        for name in set(with_own_parameters(present[CHANNELS], present)) - set(fit):
+        for name in set(per_channel.with_own_parameters(present[CHANNELS], present)) - set(fit):
             log.error(f"parameters of '{name}' are not used: there is no such joint")
         values = complete({
-            **{k: v for k, v in present.items() if (split(k)[0] or fit[0]) in fit},
+            **{k: v for k, v in present.items() if (per_channel.split(k)[0] or fit[0]) in fit},
             CHANNELS: fit,
         }, ESTIMATOR_PARAMETERS)  # fmt: skip
         self._joints = set(names)
@@ -187,19 +171,16 @@ class EstimatorNode(ManagedNode):
         if self.state == 'active':
             self.activate()
 
-    def _fitting(self, names: Iterable[str]) -> list[str]:
-        """Return the names that channels and their topics may have."""
-        fit = []
-        for name in dict.fromkeys(names):
-            with suppress(ConfigurationError):
-                channel_names({CHANNELS: [name or '?']})  # '' is no channel's name
-                full_name(self, f'~/{name}/{STANDARD_DEVIATION}')  # its longest topic
-                fit.append(name)
-        return fit
+    def _fits(self, name: str) -> bool:
+        """Return whether a channel, and its topics, may have a name."""
+        with suppress(ConfigurationError):
+            per_channel.channel_names({CHANNELS: [name or '?']})  # '' is no channel's name
+            return bool(full_name(self, f'~/{name}/{STANDARD_DEVIATION}'))  # its longest topic
+        return False
 
     def activate(self) -> None:
         """Take samples and publish."""
-        self._log = ReportLog(self)
+        self._log = diagnostics.ReportLog(self)
         for channel in self._channels:
             channel.activate()
         if self._channels:

@@ -1,84 +1,48 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What channels publish, alone and together, and the text with the parameters of their node."""
+"""Messages of one channel, and of all together; the text with the parameters of their node."""
 
 from collections.abc import Callable, Iterable, Mapping
 from math import nan
-from time import perf_counter
 from typing import Any
 
 from builtin_interfaces.msg import Time
 from fhaosmo_ros.core.observer.estimates import Estimate, TUNING
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
-from fhaosmo_ros.core.online.snapshots import Flag, pack, Snapshot
 from fhaosmo_ros.core.parameters.declaration import Parameters
 from fhaosmo_ros.core.parameters.files import dumps
 from fhaosmo_ros.core.parameters.per_channel import differing
 from fhaosmo_ros.nodes.estimator.sources import Listener
-from fhaosmo_ros.nodes.middleware.endpoints import create_publisher, DEPTH, LATCHED, Listeners
+from fhaosmo_ros.nodes.middleware.endpoints import DEPTH, Listeners
 from fhaosmo_ros.nodes.middleware.messages import labelled, message_class, time_message
-from fhaosmo_ros.topics import ARRAY, estimates_of, SNAPSHOT, STANDARD_DEVIATION, TYPED_ESTIMATES
+from fhaosmo_ros.topics import STANDARD_DEVIATION, TYPED_ESTIMATES
 import numpy as np
 from rclpy.node import Node
 from std_msgs.msg import Float64
 
-PERIOD, PERIOD_OF_SELF_TUNING = 1.0, 30.0
-"""Seconds between two snapshots; a self-tuning estimator remembers thousands of numbers."""
+Make = Callable[[Estimate, int], Any]
+"""Returns the message of an estimate and of the stamp of its sample in nanoseconds."""
 
 
-class Outputs:
-    """
-    Publishers of one channel's estimates and of its snapshots, by which a replay follows it.
+def estimate_messages(estimator: OnlineEstimator) -> dict[str, Make]:
+    """Return what makes the message of each topic of an estimator's estimates, by its name."""
+    observer, number, time = estimator.observer, Float64(), Time()  # filled again and again
+    states = [f'z{i + 1}' for i in range(observer.order)]
+    state, deviation, tuning = labelled(states), labelled([*states, 'd']), labelled(TUNING)
+    innovation = labelled([f'eps{i + 1}' for i in range(observer.levels)])
 
-    Those of the estimates have ROS' parameters qos_overrides./TOPIC.publisher.POLICY. What nobody
-    listens to is not made: a message costs more than a step with fixed gains.
-    """
+    def filled(value: float) -> Float64:
+        number.data = value
+        return number
 
-    def __init__(self, node: Node, prefix: str, estimator: OnlineEstimator) -> None:
-        observer = estimator.observer
-        self._estimator = estimator
-        states = [f'z{i + 1}' for i in range(observer.order)]
-        state, deviation, tuning = labelled(states), labelled([*states, 'd']), labelled(TUNING)
-        innovation = labelled([f'eps{i + 1}' for i in range(observer.levels)])
-        self._make: dict[str, Callable[[Estimate, int], Any]] = {
-            'gamma': lambda estimate, _: self._number(estimate.gamma),
-            STANDARD_DEVIATION: lambda *_: deviation(estimator.standard_deviation),
-            'tuning': lambda *_: tuning(np.hstack(estimator.tuning)),
-            'state': lambda estimate, _: state(estimate.z),
-            'unknown_input': lambda estimate, _: self._number(estimate.unknown_input),
-            'innovation': lambda estimate, _: innovation(estimate.innovation),
-            'stamp': lambda _, stamp: time_message(stamp, self._time),
-        }
-        self._listeners = Listeners({
-            name: create_publisher(node, message_class(kind), prefix + name)
-            for name, kind in estimates_of(observer.parameters).items()
-        })  # fmt: skip
-        self._float, self._time = Float64(), Time()  # copied by `publish`, and filled again
-        self._period = PERIOD_OF_SELF_TUNING if observer.self_tuning else PERIOD
-        self.due, self._labels = 0.0, ['']
-        self._snapshots = node.create_publisher(message_class(ARRAY), prefix + SNAPSHOT, LATCHED)
-
-    def _number(self, value: float) -> Float64:
-        self._float.data = value
-        return self._float
-
-    def publish(self, estimate: Estimate, stamp: int) -> None:
-        """Publish an estimate and, last, the stamp of its sample in nanoseconds."""
-        for name, publisher in self._listeners.heard().items():
-            publisher.publish(self._make[name](estimate, stamp))
-
-    def snapshot(self, flags: Flag) -> None:
-        """
-        Publish what the estimator remembers, and what has happened at the latest sample.
-
-        The next one is `due` (by perf_counter) a period later, after a reset with the next sample.
-        """
-        stamp = self._estimator.latest
-        if stamp is not None:
-            labels, vector = pack(Snapshot(stamp, flags, self._estimator.state_dict()))
-            if labels != self._labels:  # a state before a gap is there only after one
-                self._labels, self._message = labels, labelled(labels)
-            self._snapshots.publish(self._message(vector))
-            self.due = 0.0 if flags == Flag.RESET else perf_counter() + self._period
+    return {
+        'gamma': lambda estimate, _: filled(estimate.gamma),
+        STANDARD_DEVIATION: lambda *_: deviation(estimator.standard_deviation),
+        'tuning': lambda *_: tuning(np.hstack(estimator.tuning)),
+        'state': lambda estimate, _: state(estimate.z),
+        'unknown_input': lambda estimate, _: filled(estimate.unknown_input),
+        'innovation': lambda estimate, _: innovation(estimate.innovation),
+        'stamp': lambda _, stamp: time_message(stamp, time),
+    }
 
 
 Output = tuple[int, Estimate, Mapping[str, Any]]

@@ -15,13 +15,7 @@ from typing import Any
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.inputs import Input
 from fhaosmo_ros.messages.fields import Field, find_field, MissingElementError, Unwrapper
-from fhaosmo_ros.nodes.middleware.endpoints import (
-    full_name,
-    OVERRIDABLE,
-    SENSOR_QOS,
-    SequenceNumbers,
-    subscribe_with_info,
-)
+from fhaosmo_ros.nodes.middleware import endpoints
 from fhaosmo_ros.nodes.middleware.messages import definitions, message_class
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
@@ -34,7 +28,7 @@ Take = Callable[[int, float], None]
 
 class Listener:
     """
-    Somebody who takes one number out of each message of a source.
+    Takes one number out of each message of a source.
 
     `field` and `stamps` (header, source or reception) are not known before the topic's type;
     `error` says why its type has no such field. `lacking` messages were without it; `why`: the
@@ -44,25 +38,22 @@ class Listener:
     def __init__(self, wanted: Input, take: Take, source: 'Source') -> None:
         self.wanted, self.take, self.source = wanted, take, source
         self.field: Field | None = None
-        self.value: Callable[[Any], float]
-        self.stamps = self.error = ''
+        self.stamps = self.error = self.why = ''
         self.lacking = 0
-        self.why = ''
 
     def find(self, types: Mapping[str, Any], message_type: str) -> None:
         """Find its field in a message type, or keep the reason as `error`."""
         self.error, self.field = '', None
         try:
-            field = find_wanted(types, self.wanted._replace(message_type=message_type))
+            self.field = field = find_wanted(types, self.wanted, message_type)
         except ConfigurationError as error:
             self.error = str(error)
             return
-        self.field, self.stamps, self.value = field, self.wanted.stamp, field.value
+        self.stamps = self.wanted.stamp
         if self.stamps == 'auto':
             self.stamps = 'header' if field.header else 'source'
-        if field.wraps:
-            unwrap = Unwrapper()
-            self.value = lambda message: unwrap(field.value(message))
+        unwrap = Unwrapper()
+        self.value = (lambda message: unwrap(field.value(message))) if field.wraps else field.value
 
 
 class Source:
@@ -79,27 +70,24 @@ class Source:
 
     def __init__(self, node: Node, sources: 'Sources', topic: str) -> None:
         self._node, self._sources, self.topic = node, sources, topic
-        self.message_type = ''
-        self.heard: list[str] = []
-        self.unheard: list[str] = []
-        self.numbers, self.offset = SequenceNumbers(), 0
+        self.message_type = self._header = ''  # the latter: its name in a message
+        self.heard, self.unheard = list[str](), list[str]()
+        self.numbers, self.offset = endpoints.SequenceNumbers(), 0
         self.delay = self._delay = -math.inf
         self.on_names: Callable[[Any], None] | None = None
-        self.listeners: list[Listener] = []
-        self._served: list[Listener] = []  # those with a field
-        self._header = ''  # its name in a message
+        self.listeners, self._served = list[Listener](), list[Listener]()  # those with a field
         self._subscription: Any = None
 
     def open(self) -> bool:
-        """Subscribe if the type is given, or that of the publishers is one; return whether."""
-        if self.message_type:
-            self._take_type(self.message_type)
-        elif found := self._node.get_publishers_info_by_topic(self.topic):
-            try:
-                self._take_type(min(endpoint.topic_type for endpoint in found))
-            except (LookupError, RuntimeError) as error:  # not installed here; rcl's
-                for listener in self.listeners:
-                    listener.error = f'{self.topic}: {error}'
+        """Look for fields in the type, if it is known; return whether there is a subscription."""
+        found = self._node.get_publishers_info_by_topic(self.topic)
+        message_type = self.message_type or min((end.topic_type for end in found), default='')
+        try:
+            if message_type:
+                self._take_type(message_type)
+        except (LookupError, RuntimeError) as error:  # not installed here; rcl's
+            for listener in self.listeners:
+                listener.error = f'{self.topic}: {error}'
         return self._subscription is not None
 
     def _take_type(self, message_type: str) -> None:
@@ -108,21 +96,16 @@ class Source:
         for listener in self.listeners:
             listener.find(types, message_type)
         self._served = [listener for listener in self.listeners if listener.field]
-        self._header = next((li.field.header for li in self.listeners if li.field), '')
+        self._header = next((li.field.header for li in self._served), '')
         if self._subscription is None and (self._served or self.on_names):
             self.message_type = message_type
-            self._subscription = subscribe_with_info(
-                self._node, kind, self.topic, self._on_message, copy(SENSOR_QOS),
-                qos_overriding_options=OVERRIDABLE,
+            self._subscription = endpoints.subscribe_with_info(
+                self._node, kind, self.topic, self._on_message, copy(endpoints.SENSOR_QOS),
+                qos_overriding_options=endpoints.OVERRIDABLE,
             )  # fmt: skip
 
     def look(self) -> None:
-        """
-        Look at the topic's publishers.
-
-        The middleware has an event for incompatible QoS, but it does not name the publisher, and
-        there is none for another message type. The ROS graph has both.
-        """
+        """Look at the topic's publishers in the ROS graph: QoS events do not name them."""
         if self._subscription is None:
             return
         self.delay, self._delay = self._delay, -math.inf
@@ -188,11 +171,7 @@ class Sources:
         return source.listeners[-1]
 
     def of(self, wanted: Input) -> Source:
-        """
-        Return the source that an input is read from; new ones are not open yet.
-
-        Raises ConfigurationError for a second type of its messages.
-        """
+        """Return the source of an input, not open yet if new; raise for a second type of it."""
         topic, kind = self._node.resolve_topic_name(wanted.topic), wanted.message_type
         source = self._by_topic.setdefault(topic, Source(self._node, self, topic))
         if kind and source.message_type not in ('', kind):
@@ -224,13 +203,13 @@ class Sources:
             source.look()
 
 
-def find_wanted(types: Mapping[str, Any], wanted: Input) -> Field:
-    """Return the field of an input in its message type, or raise ConfigurationError."""
-    field = find_field(types, wanted.message_type, wanted.field, wanted.name)
+def find_wanted(types: Mapping[str, Any], wanted: Input, message_type: str) -> Field:
+    """Return the field of an input in a message type, or raise ConfigurationError."""
+    field = find_field(types, message_type, wanted.field, wanted.name)
     if wanted.stamp == 'header' and not field.header:
         raise ConfigurationError(
             "parameters 'input_stamp', 'known_input_stamps': expected messages with a header on "
-            f'{wanted.topic} for the stamps header, got {wanted.message_type}'
+            f'{wanted.topic} for the stamps header, got {message_type}'
         )
     return field
 
@@ -238,10 +217,10 @@ def find_wanted(types: Mapping[str, Any], wanted: Input) -> Field:
 def check_inputs(node: Node, inputs: Iterable[Input]) -> None:
     """Raise ConfigurationError for names, types or fields that cannot be, as far as given."""
     for wanted in inputs:
-        full_name(node, wanted.topic, "parameters 'input_topic', 'known_input_topics': ")
+        endpoints.full_name(node, wanted.topic, "parameters 'input_topic', 'known_input_topics': ")
         if wanted.message_type:
             try:
-                find_wanted(definitions(wanted.message_type), wanted)
+                find_wanted(definitions(wanted.message_type), wanted, wanted.message_type)
             except LookupError as error:
                 types = "parameter 'input_type' or 'known_input_types'"
                 raise ConfigurationError(f'{types}: {error}') from None
