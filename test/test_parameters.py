@@ -8,7 +8,8 @@ import warnings
 
 from fhaosmo_ros.core import ConfigurationError, Observer
 from fhaosmo_ros.core.parameters.declaration import Parameter
-from fhaosmo_ros.core.parameters.files import complete, dumps, load, loads, select
+from fhaosmo_ros.core.parameters.files import dumps, load, loads
+from fhaosmo_ros.core.parameters.per_channel import complete, select
 from fhaosmo_ros.core.parameters.removed import REMOVED
 from fhaosmo_ros.core.parameters.tables import (
     CHANNEL_PARAMETERS,

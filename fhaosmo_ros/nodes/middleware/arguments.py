@@ -10,7 +10,8 @@ from typing import Any
 
 from fhaosmo_ros.core.parameters.declaration import shown, unknown_parameter
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
-from fhaosmo_ros.core.parameters.files import check_one_type, is_built_in, read
+from fhaosmo_ros.core.parameters.files import read
+from fhaosmo_ros.core.parameters.per_channel import is_built_in
 from fhaosmo_ros.core.parameters.tables import NODE_TABLES
 from fhaosmo_ros.core.parameters.yaml_text import parse
 from rclpy.logging import get_logger
@@ -63,7 +64,6 @@ def read_arguments(name: str, argv: list[str]) -> tuple[dict[str, Any], Origins,
             value = parse(text)
         except ConfigurationError as error:
             raise ConfigurationError(f"parameter '{parameter}': {error}") from None
-        check_one_type(parameter, value)
         given[parameter], origins[parameter] = value, None
     others = remove_ros_args([name, *(rest if of_ros else argv)])[1:]
     if others:
@@ -86,8 +86,7 @@ def _full_name(name: str, arguments: list[str]) -> str:
 def help_of(name: str) -> str:
     """Return the help of a node: all parameters, with their defaults and what is allowed."""
     lines = [f'usage: {name} {USAGE}', '', 'Parameters and their defaults:', '']
-    table = NODE_TABLES[name]
-    for p in [*table.values(), *table.families]:
+    for p in NODE_TABLES[name].declared:
         lines.append(f'{p.name}: {shown(p.default)}')
         text = f'{p.text} ({p.allowed})'
         lines += textwrap.wrap(text, 99, initial_indent=INDENT, subsequent_indent=INDENT)

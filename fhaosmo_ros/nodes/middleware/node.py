@@ -7,14 +7,16 @@ from typing import Any
 
 from fhaosmo_ros.core.parameters.declaration import Parameter, Parameters, shown, suggestion
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
-from fhaosmo_ros.core.parameters.files import BUILT_IN, complete, is_built_in
-from fhaosmo_ros.core.parameters.per_channel import followers
+from fhaosmo_ros.core.parameters.per_channel import BUILT_IN, complete, is_built_in, split
 from fhaosmo_ros.core.parameters.tables import NODE_TABLES
-from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor
 from rclpy.exceptions import ParameterNotDeclaredException
 from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 from rosgraph_msgs.msg import Clock
+
+STEPS = 100.0
+"""Of a slider: none where one of them would exceed the default, as bounds then say nothing."""
 
 
 class RefusedError(ParameterNotDeclaredException):
@@ -49,11 +51,9 @@ def descriptor(parameter: Parameter, read_only: bool) -> ParameterDescriptor:
         read_only=read_only,
         dynamic_typing=True,
     )
-    bounds = {'from_value': parameter.lower, 'to_value': parameter.upper}
-    if parameter.slider and parameter.kind == 'double':
-        result.floating_point_range = [FloatingPointRange(**bounds)]
-    elif parameter.slider:
-        result.integer_range = [IntegerRange(**bounds)]
+    lower, upper = parameter.lower, parameter.upper
+    if parameter.kind == 'double' and upper - lower <= STEPS * parameter.default:
+        result.floating_point_range = [FloatingPointRange(from_value=lower, to_value=upper)]
     return result
 
 
@@ -133,9 +133,10 @@ class BaseNode(Node):
             return parameters
         try:
             changes = {name: table[name].coerce(found[name].value) for name in ours}
-            for name in ours:
-                for own in followers(name, self.values):
-                    changes.setdefault(own, changes[name])
+            for own, value in self.values.items():  # of a channel, while it is the common value
+                common = split(own)[1]
+                if common in changes and value == self.values[common]:
+                    changes.setdefault(own, changes[common])
             values = Parameters(table, {**self.values, **changes})
             self._next = values, changes, self._prepare(values, changes)
         except ConfigurationError as error:

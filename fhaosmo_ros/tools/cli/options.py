@@ -9,8 +9,8 @@ from typing import Any
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.parameters.declaration import Parameters, ParameterTable
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
-from fhaosmo_ros.core.parameters.files import read, select, with_origin
-from fhaosmo_ros.core.parameters.per_channel import of_named_channel
+from fhaosmo_ros.core.parameters.files import read, with_origin
+from fhaosmo_ros.core.parameters.per_channel import of_named_channel, select
 from fhaosmo_ros.core.parameters.tables import (
     CHANNEL_PARAMETERS,
     ESTIMATOR_PARAMETERS,
@@ -73,7 +73,7 @@ def channel_parameters(
     except ConfigurationError as error:
         raise with_origin(error, origins) from None
     own = of_named_channel(with_joints(values), arguments.channel, '--channel')
-    parameters = CHANNEL_PARAMETERS.complete(Parameters(ESTIMATOR_PARAMETERS, own))
+    parameters = CHANNEL_PARAMETERS.complete(own)
     try:
         OnlineEstimator(parameters)
     except ConfigurationError as error:

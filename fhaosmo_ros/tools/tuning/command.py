@@ -24,9 +24,7 @@ from fhaosmo_ros.tools.tuning.objective import TUNE_PARAMETERS
 from fhaosmo_ros.tools.tuning.tuner import simulated, Tuner
 
 TRIALS = 1000
-BOTH = ParameterTable(
-    TUNE_PARAMETERS.values(), ESTIMATOR_PARAMETERS.values(), ESTIMATOR_PARAMETERS.families
-)
+BOTH = ParameterTable(TUNE_PARAMETERS.declared, ESTIMATOR_PARAMETERS.declared)
 
 
 def main(argv: list[str] | None = None) -> int:
