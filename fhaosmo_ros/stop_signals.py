@@ -43,9 +43,9 @@ class Stop:
         self._writer.setblocking(False)
         self._set = self._raises = False
 
-    def wake_on_signals(self) -> None:
-        """Let signals end a wait; in the main thread only."""
-        signal.set_wakeup_fd(self._writer.fileno(), warn_on_full_buffer=False)
+    def fileno(self) -> int:
+        """Return what ends a wait where something is written to it."""
+        return self._writer.fileno()
 
     def set(self) -> None:
         """End all waiting, from any thread or signal handler."""
@@ -96,12 +96,7 @@ def stop_on_signals() -> Stop:
     stop = Stop()
     for number in ending_signals():
         signal.signal(number, stop.signal)
-    stop.wake_on_signals()
-    atexit.register(_ignore)
+    signal.set_wakeup_fd(stop.fileno(), warn_on_full_buffer=False)
+    for number in SIGNALS:  # else a late one kills the process, as Python removes its handlers
+        atexit.register(signal.signal, number, signal.SIG_IGN)
     return stop
-
-
-def _ignore() -> None:
-    """Ignore late signals: Python has removed its handlers, and they would kill the process."""
-    for number in SIGNALS:
-        signal.signal(number, signal.SIG_IGN)
