@@ -37,17 +37,14 @@ def descriptor(parameter: Parameter, read_only: bool) -> ParameterDescriptor:
     Typing is dynamic so that a wrong type reaches our own check, whose message names the
     parameter. Bounds are a ROS range only where a slider of rqt_reconfigure makes sense.
     """
-    fixed = not parameter.live and not read_only
-    constraints = (
-        parameter.allowed,
-        parameter.lengths,
-        'fixed while the node is configured: set it after cleanup' if fixed else '',
-    )
+    constraints = [parameter.allowed, *filter(None, [parameter.lengths])]
+    if not (parameter.live or read_only):
+        constraints.append('fixed while the node is configured: set it after cleanup')
     result = ParameterDescriptor(
         name=parameter.name,
         type=RosParameter.Type.from_parameter_value(parameter.default).value,
         description=parameter.text,
-        additional_constraints='; '.join(filter(None, constraints)),
+        additional_constraints='; '.join(constraints),
         read_only=read_only,
         dynamic_typing=True,
     )
@@ -63,8 +60,7 @@ def built_in(given: Mapping[str, Any]) -> list[RosParameter]:
     for name, value in own.items():
         flag = name in BUILT_IN
         if not isinstance(value, bool if flag else bool | int | float | str):
-            expected = 'true or false' if flag else 'one value'
-            problem = f'expected {expected}, got {shown(value)}'
+            problem = f'expected {"true or false" if flag else "one value"}, got {shown(value)}'
             raise ConfigurationError(f"parameter '{name}': {problem}")
     return [RosParameter(name, value=value) for name, value in own.items()]
 
