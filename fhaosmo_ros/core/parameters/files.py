@@ -28,21 +28,11 @@ def load(
     """
     Return what a parameter file sets for a node of this package, by name, checked and typed.
 
-    Sections that match the node's name are merged in the order of the file, as rcl does. One
-    ``/**`` section may serve several nodes, so names that only another node of the package
-    declares are ignored.
-
-    Parameters
-    ----------
-    path : path
-        A YAML file of the form ``name: {ros__parameters: {...}}``.
-    node : str
-        'estimator', 'plant' or 'arm', or a full name such as '/rig/estimator'.
-    table : ParameterTable, optional
-        What the node declares; without it, that of the last part of its name.
-    strict : bool
-        Raise if no section is the node's. ROS ignores such a file; here it is ignored unless a
-        section's name looks like a misspelt one of the node.
+    `node` is 'estimator', 'plant' or 'arm', or a full name such as '/rig/estimator'; `table` is
+    what it declares, if not that of the last part of its name. Sections that match the node's name
+    are merged in the order of the file, as rcl does. One ``/**`` section may serve several nodes,
+    so names that only another node of the package declares are ignored. A file without a section
+    for the node is ignored, as by ROS, unless a name looks like a misspelt one, or if `strict`.
 
     Raises
     ------
@@ -93,13 +83,8 @@ def make_from_file(
     """
     Return what `make` makes of the parameters that a file sets for a channel of an estimator.
 
-    The channel of a node that has a single one is called ''.
-
-    Raises
-    ------
-    ConfigurationError
-        As `load` and `make`, no section of the node, or a channel that it does not have.
-
+    The channel of a node that has a single one is called ''. Raises ConfigurationError as `load`
+    and `make`, for a file without a section of the node, or without the channel.
     """
     values = load(path, node, NODE_TABLES['estimator'], strict=True)
     try:

@@ -44,11 +44,7 @@ def select(values: Mapping[str, Any], table: ParameterTable) -> dict[str, Any]:
     """
     Check `values` and return those of `table`, leaving out other nodes' and rclpy's own.
 
-    Raises
-    ------
-    ConfigurationError
-        A name that no node of the package declares, or a bad value.
-
+    Raises ConfigurationError for a name that no node of the package declares, and a bad value.
     """
     estimator = _with_channels(channels_with_own(values))
     if CHANNELS in table:
@@ -93,16 +89,14 @@ def channel_names(values: Mapping[str, Any]) -> list[str]:
     """
     declared = ESTIMATOR_PARAMETERS[CHANNELS]
     names: Any = declared.coerce(values.get(CHANNELS, UNNAMED))
-    if names == UNNAMED:
-        return UNNAMED
-    for name in names:
+    for name in names if names != UNNAMED else ():
         if not NAME.fullmatch(name):
             raise declared.error(names, 'names of letters, digits and single _ between them')
         if name in ESTIMATOR_PARAMETERS or f'{name}.' == CONSTANTS:
             raise declared.error(names, f"names that no parameter has (there is one '{name}')")
     if len(set(names)) < len(names):
         raise declared.error(names, 'every name once')
-    return list(names)
+    return names  # type: ignore[no-any-return]
 
 
 def channels_with_own(values: Mapping[str, Any]) -> list[str]:
@@ -153,8 +147,8 @@ def of_named_channel(values: Mapping[str, Any], name: str, what: str) -> Paramet
 
 def differing(values: Parameters) -> dict[str, Any]:
     """Return the common values, and of the channels' own those that are not the common ones."""
+    parts = {name: split(name) for name in values}
     return {
-        name: value
-        for name, value in values.items()
-        if not split(name)[0] or value != values.get(split(name)[1])
-    }
+        name: values[name] for name, (channel, common) in parts.items()
+        if not channel or values[name] != values.get(common)
+    }  # fmt: skip
