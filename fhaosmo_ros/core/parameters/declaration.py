@@ -23,48 +23,26 @@ KINDS = {
 }  # fmt: skip
 TYPES: dict[str, Any] = {'bool': bool, 'int': int, 'double': float, 'string': str}
 ANY_NAME = '.NAME'
-"""End of the name of a declaration that stands for any number of parameters."""
+"""
+End of the name of a declaration that stands for any number of parameters that users name, each a
+letter, then letters, digits and _.
+"""
 
 
 @dataclass(frozen=True)
 class Parameter:
-    """
-    One parameter: the only place where its name, default, unit, bounds and text stand.
+    """One parameter: the only place where its name, default, unit, bounds and text stand."""
 
-    Attributes
-    ----------
-    name : str
-        Name in YAML, on the command line and in ROS. One that ends in .NAME stands for any number
-        of parameters that users name, each a letter, then letters, digits and _.
-    default : Value
-        Its type decides the parameter's type.
-    text : str
-        What it does, one or two sentences.
-    unit : str
-        SI unit, empty where there is none.
-    lower, upper : float
-        Allowed interval of a number, of each one of a list.
-    lower_open : bool
-        True where `lower` itself is not allowed.
-    choices : tuple of str
-        Allowed values of a string.
-    live : bool
-        False where it can't change in a running node (read-only in ROS).
-    lengths : str
-        Allowed numbers of values of a list, in words, for the documentation.
-
-    """
-
-    name: str
-    default: Value
-    text: str
-    unit: str = ''
-    lower: float = -math.inf
+    name: str  # in YAML, on the command line and in ROS; see `ANY_NAME`
+    default: Value  # its type is the parameter's type
+    text: str  # what it does, one or two sentences
+    unit: str = ''  # SI, empty where there is none
+    lower: float = -math.inf  # with `upper` the allowed interval, of each number of a list
     upper: float = math.inf
-    lower_open: bool = False
-    choices: tuple[str, ...] = ()
-    live: bool = True
-    lengths: str = ''
+    lower_open: bool = False  # `lower` itself is not allowed
+    choices: tuple[str, ...] = ()  # allowed values of a string
+    live: bool = True  # it can change in a running node
+    lengths: str = ''  # allowed numbers of values of a list, in words, for the documentation
 
     @property
     def kind(self) -> str:
@@ -85,16 +63,10 @@ class Parameter:
 
     def coerce(self, value: Any) -> Value:
         """
-        Return `value` in the parameter's own type, or raise.
+        Return `value` in the parameter's own type, or raise ConfigurationError.
 
         An integer is accepted where a number is meant, one number for a list, and the text of a
         number or a list: `ros2 param set` sends 1e-3 and ``[15, 15.5]`` as texts.
-
-        Raises
-        ------
-        ConfigurationError
-            Wrong type, out of bounds, not finite or not one of the choices.
-
         """
         given, kind = value, self.kind
         is_list = kind.endswith('_array')
@@ -190,13 +162,8 @@ class ParameterTable(Mapping[str, Parameter]):
         """
         Check names, types and bounds of `values`; what is absent stays absent.
 
-        ``{'constants': {'k': 3}}`` is the same as ``{'constants.k': 3}``.
-
-        Raises
-        ------
-        ConfigurationError
-            An unknown name (with the closest known one), or a bad value.
-
+        ``{'constants': {'k': 3}}`` is the same as ``{'constants.k': 3}``. Raises
+        ConfigurationError for an unknown name (with the closest known one), or a bad value.
         """
         flat: dict[str, Any] = {}
         for name, value in values.items():
@@ -212,16 +179,10 @@ class ParameterTable(Mapping[str, Parameter]):
 
 class Parameters(dict[str, Any]):
     """
-    Values of all parameters of a table, checked once and each in its own type; not to be changed.
+    Values of all parameters of a `table`, checked once and each in its own type.
 
     `ParameterTable.complete` makes them where values enter the package. Code that receives them
-    does not check them again.
-
-    Attributes
-    ----------
-    table : ParameterTable
-        What they are the values of.
-
+    neither checks nor changes them.
     """
 
     def __init__(self, table: ParameterTable, checked: dict[str, Any]) -> None:
