@@ -201,7 +201,7 @@ LATER = (
     (LATER, 'estimator', {'epsilon': 0.4, 'max_gap': 2.0}),
     (BOTH, 'estimator', {'order': 2, 'epsilon': 0.3}),
     (BOTH, 'plant', {'order': 2, 'noise_std': 0.1}),
-    (setting('max_gap: .5E0'), 'estimator', {'max_gap': 0.5}),
+    (setting('alpha: [1, .5E0]'), 'estimator', {'alpha': [1.0, 0.5]}),
 ])  # fmt: skip
 def test_values(tmp_path, text, node, values):
     assert loaded(tmp_path, text, node) == values

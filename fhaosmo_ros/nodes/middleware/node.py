@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What every node is: its parameters, declared in the core, become those of ROS, also live."""
 
-from collections.abc import Callable, Iterable, Mapping
-from functools import partial
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from fhaosmo_ros.core.parameters.declaration import Parameter, Parameters, shown, suggestion
@@ -96,19 +95,18 @@ class BaseNode(Node):
         self, msg_type: Any, topic: str, callback: Any, *arguments: Any, **options: Any
     ) -> Any:
         """Return a subscription; that of /clock, which rclpy makes, passes over negative times."""
-        if msg_type is Clock:
-            callback = partial(self._take_time, callback)
-        return super().create_subscription(msg_type, topic, callback, *arguments, **options)
 
-    def _take_time(self, take: Callable[[Clock], None], message: Clock) -> None:
-        """Take a time that is not negative: in rclpy 7.1 such a one ends the node."""
-        if message.clock.sec >= 0:
-            take(message)
-            return
-        self.get_logger().warning(
-            f'rejected a time on /clock: expected seconds >= 0, got {message.clock.sec}',
-            throttle_duration_sec=5.0,
-        )
+        def take_time(message: Clock) -> None:
+            if message.clock.sec >= 0:  # else rclpy 7.1 ends the node
+                callback(message)
+                return
+            self.get_logger().warning(
+                f'rejected a time on /clock: expected seconds >= 0, got {message.clock.sec}',
+                throttle_duration_sec=5.0,
+            )
+
+        take = take_time if msg_type is Clock else callback
+        return super().create_subscription(msg_type, topic, take, *arguments, **options)
 
     def extend(self, values: Parameters) -> None:
         """Go on with values, perhaps of a larger table: what is new is declared."""
