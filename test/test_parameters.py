@@ -154,8 +154,7 @@ def test_one_file_serves_channels_and_plant_and_a_replay_takes_one_channel(tmp_p
     words = ['--params-file', str(rig), '-p', 'knee.lambda:=3']
     default = CHANNEL_PARAMETERS.defaults()
     assert replayed(*words, '--channel', 'hip') == default | {'epsilon': 7.0}
-    of_knee = default | {'epsilon': 5.0, 'lambda': [3.0]}
-    assert replayed(*words, '--channel', 'knee') == of_knee
+    assert replayed(*words, '--channel', 'knee') == default | {'epsilon': 5.0, 'lambda': [3.0]}
     with pytest.raises(ConfigurationError, match='--channel: expected hip or knee, got none'):
         replayed(*words)
     with pytest.raises(ConfigurationError, match=r'--channel: expected none, .* got hip'):

@@ -123,7 +123,7 @@ class ParameterTable(Mapping[str, Parameter]):
         self.declared = tuple(self._by_name.values())
 
     def __getitem__(self, name: str) -> Parameter:
-        if name in self._by_name:
+        if name in self._by_name or '.' not in name:
             return self._by_name[name]
         family = re.sub(r'\.[A-Za-z][A-Za-z0-9_]*$', ANY_NAME, name)
         return replace(self._by_name[family], name=name)
