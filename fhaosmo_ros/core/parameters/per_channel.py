@@ -11,11 +11,7 @@ from dataclasses import replace
 import re
 from typing import Any
 
-from fhaosmo_ros.core.parameters.declaration import (
-    Parameters,
-    ParameterTable,
-    unknown_parameter,
-)
+from fhaosmo_ros.core.parameters.declaration import Parameters, ParameterTable, unknown_parameter
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.tables import (
     CHANNEL_PARAMETERS,
