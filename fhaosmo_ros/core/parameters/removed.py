@@ -19,7 +19,6 @@ REMOVED = {
     'input_depth': "set 'qos_overrides./TOPIC.subscription.depth'",
     'divergence_limit': 'leave it out: samples beyond 1e60 are rejected',
     'sines': 'leave it out: a sum has 5 sines',
-    'max_channels': "leave it out: 'channels' may name more joints than 64",
     'search': "leave it out: 'tune' searches the model of d, or the gains where 'lambda' is set",
 }
 """What a message says of a name that was a parameter once."""

@@ -41,8 +41,6 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
-MOST_JOINTS = 64  # that a message, which anybody may send, makes channels of
-
 
 class EstimatorNode(ManagedNode):
     """
@@ -160,14 +158,15 @@ class EstimatorNode(ManagedNode):
             new = [name for name in names if name not in self._joints]
             self._left_out.append(left_out(new, 'not in the first message'))
             return
+        most = present['max_channels']
         fit = self._fitting(names)
         bad = [name for name in dict.fromkeys(names) if name not in fit]
         hint = 'name a channel, and set its input_field to position[NAME]'
         self._left_out = [
             left_out(bad, f"can't be the name of a channel; {hint}"),
-            left_out(fit[MOST_JOINTS:], f'beyond the first {MOST_JOINTS}; name the channels'),
+            left_out(fit[most:], f'beyond max_channels ({most}); raise it'),
         ]
-        fit = fit[:MOST_JOINTS]
+        fit = fit[:most]
         if not fit:
             return
         for name in set(channels_with_own(present)) - set(fit):
