@@ -24,6 +24,12 @@ CHECK = ['hypothesis', 'pytest', 'pytest-xdist']
 TUNE = ['cmaes', 'optuna>=4,<6']
 ARM = ['pin>=3.3,<5']
 DOCS = ['myst-parser', 'sphinx', 'sphinx-rtd-theme']
+TEST = [
+    *ARM, *CHECK, *DOCS, *TUNE, 'colcon-common-extensions', 'cython-lint', 'import-linter',
+    'mcap-ros2-support', 'mypy', 'ruff', 'sympy', 'types-PyYAML',
+    'scikit-fuzzy', 'networkx', 'packaging',  # it imports these two but declares nothing
+    'setuptools>=68,<80',  # from 80 on, colcon build --symlink-install silently copies
+]  # fmt: skip
 ROS = (
     'builtin-interfaces', 'diagnostic-msgs', 'geometry-msgs', 'lifecycle-msgs', 'rcl-interfaces',
     'rclpy', 'rmw-fastrtps-cpp', 'rosgraph-msgs', 'sensor-msgs', 'std-msgs', 'std-srvs',
@@ -41,28 +47,22 @@ def extensions():
     """
     Return one extension for each .pyx file; `build_ext` below translates and compiles them.
 
-    In the environment, FHAOSMO_DEBUG=1 builds with bounds checks, and FHAOSMO_ASAN=1 with the
-    compiler's AddressSanitizer. Loops over the members of the self-tuning observer are sums that
-    may be taken in any order, so that they become vector instructions; see
-    core/vectors.pxd. All else gives the same bits on each processor (no
-    product and sum are contracted), and -O3 makes it no faster. What is compiled of studies/
-    is built in a checkout, never installed.
+    In the environment, FHAOSMO_DEBUG=1 builds with bounds checks; CFLAGS and LDFLAGS may have
+    -fsanitize=address. Loops over the members of the self-tuning observer are sums that may be
+    taken in any order, so that they become vector instructions; see core/vectors.pxd. All else
+    gives the same bits on each processor (no product and sum are contracted), and -O3 makes it no
+    faster. What is compiled of studies/ is built in a checkout, never installed.
     """
-    sanitize = ['-fsanitize=address'] if os.environ.get('FHAOSMO_ASAN') == '1' else []
     found = []
     for path in sorted([*Path(NAME).rglob('*.pyx'), *Path('studies').rglob('*.pyx')]):
-        options = ['-O1', '-g'] if DEBUG else ['-O2', '-g0']
-        options += ['-fno-math-errno', *sanitize]
+        options = ['-fno-math-errno', *(['-O1', '-g'] if DEBUG else ['-O2', '-g0'])]
         if {'self_tuning', 'arm'} & set(path.parts):
             options += ['-fno-trapping-math', '-fno-signed-zeros', '-fassociative-math']
             options += [] if DEBUG else ['-O3']
         else:
             options.append('-ffp-contract=off')
         name = '.'.join(path.with_suffix('').parts)
-        found.append(Extension(
-            name, [str(path)], libraries=['m'], extra_compile_args=options,
-            extra_link_args=sanitize,
-        ))  # fmt: skip
+        found.append(Extension(name, [str(path)], libraries=['m'], extra_compile_args=options))
     return found
 
 
@@ -95,13 +95,9 @@ class BuildExtensions(build_ext):
         # Processes, not threads: Cython is Python. They must not run this file again.
         multiprocessing.set_start_method('fork', force=True)
         translated = cythonize(
-            list(self.extensions),
-            nthreads=self.parallel,
-            quiet=True,
-            force=self.force,
-            build_dir=self.build_temp,
-            compiler_directives=DIRECTIVES,
-        )
+            list(self.extensions), nthreads=self.parallel, quiet=True, force=self.force,
+            build_dir=self.build_temp, compiler_directives=DIRECTIVES,
+        )  # fmt: skip
         for extension, c in zip(self.extensions, translated, strict=True):
             extension.sources = c.sources
         super().run()
@@ -156,24 +152,7 @@ setup(
         'tune': TUNE,
         'compare': TUNE,
         'check': CHECK,
-        'test': [
-            *ARM,
-            *CHECK,
-            *DOCS,
-            *TUNE,
-            'colcon-common-extensions',
-            'cython-lint',
-            'import-linter',
-            'mcap-ros2-support',
-            'mypy',
-            'networkx',  # this and packaging: scikit-fuzzy imports them but declares nothing
-            'packaging',
-            'ruff',
-            'scikit-fuzzy',
-            'setuptools>=68,<80',  # from 80 on, colcon build --symlink-install silently copies
-            'sympy',
-            'types-PyYAML',
-        ],
+        'test': TEST,
     },
     # Not the main of a command's module: importing that takes a second, and a signal during it
     # must end the command too.

@@ -7,7 +7,7 @@ install, `ros2 run fhaosmo_ros COMMAND [ARGUMENTS]` in a workspace.
 """
 
 from collections.abc import Callable
-from functools import partial
+from functools import cache, partial
 import gc
 import importlib
 import os
@@ -31,21 +31,15 @@ def usage() -> str:
 
 def main(argv: list[str] | None = None) -> int:
     """Run the command that `argv` names and return its exit code (2: no such command)."""
-    arguments = sys.argv[1:] if argv is None else argv
-    if not arguments:
-        print(usage(), file=sys.stderr)
-        return 2
-    name, *rest = arguments
-    if name in ('-h', '--help'):
-        print(usage())
+    name, *rest = (sys.argv[1:] if argv is None else argv) or ['']
+    if name in COMMANDS:
+        return run(name, rest)
+    if name in ('-h', '--help', '--version'):
+        print(f'fhaosmo_ros {__version__}' if name == '--version' else usage())
         return 0
-    if name == '--version':
-        print(f'fhaosmo_ros {__version__}')
-        return 0
-    if name not in COMMANDS:
-        print(f'error: no command {name!r} (commands: {", ".join(COMMANDS)})', file=sys.stderr)
-        return 2
-    return run(name, rest)
+    unknown = f'error: no command {name!r} (commands: {", ".join(COMMANDS)})'
+    print(unknown if name else usage(), file=sys.stderr)
+    return 2
 
 
 def run(name: str, arguments: list[str] | None = None) -> int:
@@ -55,17 +49,16 @@ def run(name: str, arguments: list[str] | None = None) -> int:
     code = 0 if COMMANDS[name][0].startswith('.nodes.') else 130
     for number in ending_signals():
         signal.signal(number, lambda *_: os._exit(code))
-    told: set[str] = set()
     usual = warnings.showwarning
+    tell = cache(lambda text: print(f'{name}: warning: {text}', file=sys.stderr))
 
-    def tell(warning: Warning | str, category: type[Warning], *place: Any) -> None:
-        if category is not UserWarning:
+    def show(warning: Warning | str, category: type[Warning], *place: Any) -> None:
+        if category is UserWarning:
+            tell(str(warning))
+        else:
             usual(warning, category, *place)
-        elif str(warning) not in told:
-            told.add(str(warning))
-            print(f'{name}: warning: {warning}', file=sys.stderr)
 
-    warnings.showwarning = tell  # ours in a line, once; Python's way has a path in the package
+    warnings.showwarning = show  # ours in a line, once; Python's way has a path in the package
     try:
         # Imported only now: a node needs ROS, and the help must not wait for numpy.
         gc.disable()  # nearly all that an import makes stays; looking for garbage takes 0.1 s

@@ -9,14 +9,8 @@ Import nothing heavy here: setup.py reads this file before any dependency is ins
 COMMANDS = {
     'estimator': ('.nodes.estimator.node', 'node: estimate states and unknown input of y'),
     'arm': ('.nodes.arm', 'node: estimate external torques and contacts of a robot arm'),
-    'calibrate': (
-        '.tools.arm.calibrate',
-        'find what the URDF of an arm does not say, from free motion',
-    ),
-    'replay_arm': (
-        '.tools.arm.replay',
-        'estimate external torques from a bag, as the node arm would',
-    ),
+    'calibrate': ('.tools.arm.calibrate', 'find what the URDF of an arm lacks, from free motion'),
+    'replay_arm': ('.tools.arm.replay', 'estimate external torques from a bag, as arm would'),
     'plant': ('.nodes.plant', 'node: simulate a plant and publish y and the truth'),
     'demo': ('.tools.demo', 'run plant and estimator, record, report, draw a figure'),
     'record': ('.tools.record', "record y and the estimator's topics to a bag"),

@@ -10,7 +10,6 @@ from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
-from fhaosmo_ros.core.parameters.declaration import Parameter
 from fhaosmo_ros.core.parameters.per_channel import CHANNELS, FROM_JOINTS
 from fhaosmo_ros.core.parameters.tables import CHANNEL_PARAMETERS
 from fhaosmo_ros.messages.fields import JOINT_STATE
@@ -50,17 +49,7 @@ def with_joints(values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def measured_output(values: Mapping[str, Any], channel: str = '') -> Input:
-    """
-    Return what y is.
-
-    Parameters
-    ----------
-    values : mapping
-        Parameters of the channel, complete.
-    channel : str
-        Its name, '' without named channels.
-
-    """
+    """Return what y is, by the complete parameters of a channel; its name is '' without names."""
     *parts, stamp = (values[f'input_{part}'] for part in PARTS)
     if stamp == 'auto' and 'header' in values['known_input_stamps']:
         stamp = 'header'
@@ -71,28 +60,24 @@ def known_inputs(
     values: Mapping[str, Any], names: Sequence[str], channel: str = ''
 ) -> dict[str, Input]:
     """
-    Return what the known inputs are, by their names in the model.
+    Return what the known inputs are that the model uses, by their `names` in it; else as for y.
 
-    Parameters
-    ----------
-    values, channel
-        As for `measured_output`.
-    names : sequence of str
-        Of the known inputs that the model uses, such as ``['u']``.
-
-    Raises
-    ------
-    ConfigurationError
-        A list with neither one entry nor one for each known input, or inputs by their header's
-        stamp where y is not.
-
+    Raises ConfigurationError for a list with neither one entry nor one for each of them, and for
+    inputs by their header's stamp where y is not.
     """
     stamps, by = CHANNEL_PARAMETERS['known_input_stamps'], values['input_stamp']
-    given = values[stamps.name]
-    if 'header' in given and by not in ('auto', 'header'):
-        raise stamps.error(given, f'reception where input_stamp is {by}')
-    lists = (CHANNEL_PARAMETERS[f'known_input_{part}s'] for part in PARTS)
-    columns = [_one_each(declared, values, names) for declared in lists]
+    if 'header' in values[stamps.name] and by not in ('auto', 'header'):
+        raise stamps.error(values[stamps.name], f'reception where input_stamp is {by}')
+    columns = []
+    for part in PARTS:
+        declared = CHANNEL_PARAMETERS[f'known_input_{part}s']
+        given: list[str] = values[declared.name]
+        if len(given) not in (1, len(names)):
+            listed = ', '.join(names)
+            raise declared.error(
+                given, f'one for each known input that phi uses ({listed}), or one for all'
+            )
+        columns.append(given if len(given) == len(names) else given * len(names))
     return {
         name: _input(name, *parts, channel) for name, *parts in zip(names, *columns, strict=True)
     }
@@ -109,25 +94,11 @@ class Pairing:
     long as none comes later than that. Any other input is the latest one that came before the
     sample. Stamps are in nanoseconds.
 
-    Parameters
-    ----------
-    values : mapping
-        Parameters of the channel.
-    names : sequence of str
-        All known inputs of the model.
-    known : mapping of str to Input
-        Those that it uses.
-    held : sequence of float
-        What they are before the first ones come.
-
-    Attributes
-    ----------
-    by_stamp : bool
-        An input is by its header's stamp; else none has to be paired.
-    late, ahead : int
-        Inputs that came after their sample had been released; samples that were released when
-        all of an input's stamps were later than theirs, or the next one by more than max_gap.
-
+    `values` are the parameters of the channel, `names` all known inputs of the model, `known`
+    those that it uses, `held` what they are before the first ones come. `by_stamp` is False where
+    none has to be paired. `late` inputs came after their sample had been released; `ahead` samples
+    were released when all of an input's stamps were later than theirs, or the next one by more
+    than max_gap.
     """
 
     def __init__(
@@ -193,17 +164,6 @@ class Pairing:
                 u[j] = self._held[j]
             self._done = stamp
             yield sample, u
-
-
-def _one_each(declared: Parameter, values: Mapping[str, Any], names: Sequence[str]) -> list[str]:
-    given: list[str] = values[declared.name]
-    if len(given) == 1:
-        return given * len(names)
-    if len(given) != len(names):
-        raise declared.error(
-            given, f'one for each known input that phi uses ({", ".join(names)}), or one for all'
-        )
-    return given
 
 
 def _input(

@@ -17,10 +17,8 @@ ESTIMATOR = {
 COMMON = {
     'namespace': ('', 'namespace of what is started'),
     'use_sim_time': ('false', 'take the time from /clock'),
-    'log_level': ('info', 'least severity that is logged'),
+    'log_level': ('info', 'least severity that is logged: debug, info, warn, error, fatal'),
 }
-CHOICES = {'log_level': ['debug', 'info', 'warn', 'error', 'fatal']}
-"""Arguments that may have some values only."""
 OF_LAUNCH = ('params_file', 'namespace', 'name', 'log_level', 'respawn')
 """Arguments that are no parameters of the node."""
 
@@ -29,13 +27,8 @@ def description(executables: list[str], arguments: Mapping[str, tuple[str, str]]
     """
     Return the launch description of nodes of this package; where one of several ends, all do.
 
-    Parameters
-    ----------
-    executables : list of str
-    arguments : mapping
-        Default and description of each by name, beside the common ones. Those that are not of
-        launch are parameters of the nodes; one that is empty leaves its parameter to the file.
-
+    `arguments` are default and description by name, beside the common ones. Those that are not of
+    launch are parameters of the nodes; one that is empty leaves its parameter to the file.
     """
     from launch import LaunchDescription  # not on PyPI, so not where it is not needed
     from launch.actions import DeclareLaunchArgument, OpaqueFunction, Shutdown
@@ -70,9 +63,7 @@ def description(executables: list[str], arguments: Mapping[str, tuple[str, str]]
         ]
 
     declared = [
-        DeclareLaunchArgument(
-            name, default_value=default, description=text, choices=CHOICES.get(name)
-        )
+        DeclareLaunchArgument(name, default_value=default, description=text)
         for name, (default, text) in arguments.items()
     ]
     return LaunchDescription([*declared, OpaqueFunction(function=start)])

@@ -17,9 +17,8 @@ def ending_signals() -> list[signal.Signals]:
     """
     Return the signals that are to end this process.
 
-    SIGHUP comes when a terminal or an SSH connection closes; it is not among them in a process
-    that nohup(1) started, which ignores it. An ignored SIGINT ends a process all the same: a shell
-    without job control starts its background jobs so.
+    SIGHUP comes when a terminal or an SSH connection closes; nohup(1) lets a process ignore it. An
+    ignored SIGINT ends one all the same: a shell without job control starts background jobs so.
     """
     return [s for s in SIGNALS if s != signal.SIGHUP or signal.getsignal(s) != signal.SIG_IGN]
 
@@ -39,19 +38,15 @@ class Stop:
     """
 
     def __init__(self) -> None:
-        self._reader, self._writer = socket.socketpair()
-        self._writer.setblocking(False)
+        self._reader, self.writer = socket.socketpair()
+        self.writer.setblocking(False)
         self._set = self._raises = False
-
-    def wake_on_signals(self) -> None:
-        """Let signals end a wait; in the main thread only."""
-        signal.set_wakeup_fd(self._writer.fileno(), warn_on_full_buffer=False)
 
     def set(self) -> None:
         """End all waiting, from any thread or signal handler."""
         self._set = True
         with contextlib.suppress(BlockingIOError):  # full: the wait ends anyway
-            self._writer.send(b'\0')
+            self.writer.send(b'\0')
 
     def signal(self, number: int = signal.SIGINT, frame: FrameType | None = None) -> None:
         """Handle a signal: `set`, and raise `Stopped` if within `raising`, but only once."""
@@ -96,12 +91,7 @@ def stop_on_signals() -> Stop:
     stop = Stop()
     for number in ending_signals():
         signal.signal(number, stop.signal)
-    stop.wake_on_signals()
-    atexit.register(_ignore)
+    signal.set_wakeup_fd(stop.writer.fileno(), warn_on_full_buffer=False)
+    for number in SIGNALS:  # else a late one kills the process, as Python removes its handlers
+        atexit.register(signal.signal, number, signal.SIG_IGN)
     return stop
-
-
-def _ignore() -> None:
-    """Ignore late signals: Python has removed its handlers, and they would kill the process."""
-    for number in SIGNALS:
-        signal.signal(number, signal.SIG_IGN)

@@ -64,7 +64,7 @@ origin="$root $interpreter $distribution $(cksum <setup.py)"
 
 # What the core in this checkout was compiled from, and what came of it: compiled when this changes.
 compiled() {
-    { echo "$interpreter ${FHAOSMO_DEBUG:-} ${FHAOSMO_ASAN:-}"
+    { echo "$interpreter ${FHAOSMO_DEBUG:-} ${CFLAGS:-}"
       find fhaosmo_ros studies -name '*.pyx' -o -name '*.pxd' | LC_ALL=C sort | xargs cksum setup.py
       find fhaosmo_ros studies -name '*.so' | LC_ALL=C sort; } | cksum
 }

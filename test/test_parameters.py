@@ -7,7 +7,8 @@ import warnings
 
 from fhaosmo_ros.core import ConfigurationError, Observer
 from fhaosmo_ros.core.parameters.declaration import Parameter
-from fhaosmo_ros.core.parameters.files import complete, dumps, load, loads, select
+from fhaosmo_ros.core.parameters.files import dumps, load, loads
+from fhaosmo_ros.core.parameters.per_channel import complete, select
 from fhaosmo_ros.core.parameters.removed import REMOVED
 from fhaosmo_ros.core.parameters.tables import (
     CHANNEL_PARAMETERS,
@@ -151,8 +152,7 @@ def test_one_file_serves_channels_and_plant_and_a_replay_takes_one_channel(tmp_p
     words = ['--params-file', str(rig), '-p', 'knee.lambda:=3']
     default = CHANNEL_PARAMETERS.defaults()
     assert replayed(*words, '--channel', 'hip') == default | {'epsilon': 7.0}
-    of_knee = default | {'epsilon': 5.0, 'lambda': [3.0]}
-    assert replayed(*words, '--channel', 'knee') == of_knee
+    assert replayed(*words, '--channel', 'knee') == default | {'epsilon': 5.0, 'lambda': [3.0]}
     with pytest.raises(ConfigurationError, match='--channel: expected hip or knee, got none'):
         replayed(*words)
     with pytest.raises(ConfigurationError, match=r'--channel: expected none, .* got hip'):
@@ -198,7 +198,7 @@ LATER = (
     (LATER, 'estimator', {'epsilon': 0.4, 'max_gap': 2.0}),
     (BOTH, 'estimator', {'order': 2, 'epsilon': 0.3}),
     (BOTH, 'plant', {'order': 2, 'noise_std': 0.1}),
-    (setting('max_gap: .5E0'), 'estimator', {'max_gap': 0.5}),
+    (setting('alpha: [1, .5E0]'), 'estimator', {'alpha': [1.0, 0.5]}),
 ])  # fmt: skip
 def test_values(tmp_path, text, node, values):
     assert loaded(tmp_path, text, node) == values

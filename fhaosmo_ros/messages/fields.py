@@ -87,24 +87,13 @@ def find_field(
     """
     Find a field in a message type; without a text, take the type's only number or its `data`.
 
-    Parameters
-    ----------
-    types : mapping
-        Definitions by type.
-    message_type : str
-        Such as 'sensor_msgs/msg/JointState'.
-    text : str or None
-        Names separated by dots. [index] or [name of the element] follows the name of a list;
-        names are those in the list of strings beside it. roll, pitch and yaw of a quaternion.
-    name : str
-        Which element is meant where the text ends with a list; such a text may be left out for a
-        JointState, whose ``position`` it is then.
+    The text has names separated by dots. [index] or [name of the element] follows the name of a
+    list; names are those in the list of strings beside it. roll, pitch and yaw of a quaternion.
+    `name` is the element that is meant where the text ends with a list; such a text may be left
+    out for a JointState, whose ``position`` it is then.
 
-    Raises
-    ------
-    ConfigurationError
-        There is no such field, or it holds no number; the message lists the fields that do.
-
+    Raises ConfigurationError if there is no such field, or it holds no number; the message lists
+    the fields that do.
     """
     known = {path: (lists, angle) for path, lists, angle in _numbers(types, message_type)}
     usual = [path for path in known if not path.endswith(OF_HEADERS)]

@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.per_channel import of_channel
-from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
 from fhaosmo_ros.core.parameters.units import derivative_unit, titled
 from fhaosmo_ros.core.simulation.metrics import chatter, rms
 from fhaosmo_ros.stop_signals import Stop
@@ -109,8 +108,7 @@ def read_curves(path: Path, names: list[str] | None, plant: str) -> list[Curves]
 def _curves(reader: BagReader, name: str, plant: str) -> Curves:
     epsilon, unit = None, ''
     if recorded := recorded_parameters(reader, name):
-        own = of_channel(recorded.values, recorded.channel)
-        values = ESTIMATOR_PARAMETERS.defaults() | own
+        values = of_channel(recorded.values, recorded.channel)
         unit = values['measurement_unit']
         if values['structure'] == 'cascade' and values['gains'] == 'fixed':
             epsilon = values['epsilon']

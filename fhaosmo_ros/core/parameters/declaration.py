@@ -18,57 +18,31 @@ import numpy as np
 Value: TypeAlias = bool | int | float | str | list[float] | list[str]
 
 KINDS = {
-    'bool': 'true or false',
-    'int': 'an integer',
-    'double': 'a number',
-    'string': 'a string',
-    'double_array': 'a list of numbers',
-    'string_array': 'a list of strings',
-}
+    'bool': 'true or false', 'int': 'an integer', 'double': 'a number', 'string': 'a string',
+    'double_array': 'a list of numbers', 'string_array': 'a list of strings',
+}  # fmt: skip
 TYPES: dict[str, Any] = {'bool': bool, 'int': int, 'double': float, 'string': str}
 ANY_NAME = '.NAME'
-"""End of the name of a declaration that stands for any number of parameters."""
+"""
+End of the name of a declaration that stands for any number of parameters that users name, each a
+letter, then letters, digits and _.
+"""
 
 
 @dataclass(frozen=True)
 class Parameter:
-    """
-    One parameter: the only place where its name, default, unit, bounds and text stand.
+    """One parameter: the only place where its name, default, unit, bounds and text stand."""
 
-    Attributes
-    ----------
-    name : str
-        Name in YAML, on the command line and in ROS. One that ends in .NAME stands for any number
-        of parameters that users name, each a letter, then letters, digits and _.
-    default : Value
-        Its type decides the parameter's type.
-    text : str
-        What it does, one or two sentences.
-    unit : str
-        SI unit, empty where there is none.
-    lower, upper : float or None
-        Allowed interval, of each element for a list; None for no bound.
-    lower_open : bool
-        True where `lower` itself is not allowed.
-    choices : tuple of str
-        Allowed values of a string.
-    live : bool
-        False where it can't change in a running node (read-only in ROS).
-    lengths : str
-        Allowed numbers of values of a list, in words, for the documentation.
-
-    """
-
-    name: str
-    default: Value
-    text: str
-    unit: str = ''
-    lower: float | None = None
-    upper: float | None = None
-    lower_open: bool = False
-    choices: tuple[str, ...] = ()
-    live: bool = True
-    lengths: str = ''
+    name: str  # in YAML, on the command line and in ROS; see `ANY_NAME`
+    default: Value  # its type is the parameter's type
+    text: str  # what it does, one or two sentences
+    unit: str = ''  # SI, empty where there is none
+    lower: float = -math.inf  # with `upper` the allowed interval, of each number of a list
+    upper: float = math.inf
+    lower_open: bool = False  # `lower` itself is not allowed
+    choices: tuple[str, ...] = ()  # allowed values of a string
+    live: bool = True  # it can change in a running node
+    lengths: str = ''  # allowed numbers of values of a list, in words, for the documentation
 
     @property
     def kind(self) -> str:
@@ -78,42 +52,21 @@ class Parameter:
         return next(kind for kind in TYPES if TYPES[kind] is type(item)) + '_array' * is_list
 
     @property
-    def slider(self) -> bool:
-        """
-        True if the bounds of a number are a range to choose from.
-
-        Else they only keep out what cannot be meant. A slider has 100 steps: one of them must not
-        exceed the default, nor 1 for an integer.
-        """
-        if self.kind not in ('int', 'double') or self.lower is None or self.upper is None:
-            return False
-        step = abs(float(self.default))  # type: ignore[arg-type]
-        return self.upper - self.lower <= 100.0 * (max(step, 1.0) if self.kind == 'int' else step)
-
-    @property
     def allowed(self) -> str:
         """Allowed values, in words."""
         if self.choices:
             return 'one of ' + ', '.join(self.choices)
         text = KINDS[self.kind]
-        if self.lower is not None:
-            text += f' {">" if self.lower_open else ">="} {self.lower:g}'
-        if self.upper is not None:
-            text += f'{" and" if self.lower is not None else ""} <= {self.upper:g}'
+        if self.upper < math.inf:
+            text += f' {">" if self.lower_open else ">="} {self.lower:g} and <= {self.upper:g}'
         return text + (f' [{self.unit}]' if self.unit else '')
 
     def coerce(self, value: Any) -> Value:
         """
-        Return `value` in the parameter's own type, or raise.
+        Return `value` in the parameter's own type, or raise ConfigurationError.
 
         An integer is accepted where a number is meant, one number for a list, and the text of a
         number or a list: `ros2 param set` sends 1e-3 and ``[15, 15.5]`` as texts.
-
-        Raises
-        ------
-        ConfigurationError
-            Wrong type, out of bounds, not finite or not one of the choices.
-
         """
         given, kind = value, self.kind
         is_list = kind.endswith('_array')
@@ -146,9 +99,7 @@ class Parameter:
             return None
         if isinstance(item, bool | str):
             return item if not self.choices or item in self.choices else None
-        lower = -math.inf if self.lower is None else self.lower
-        upper = math.inf if self.upper is None else self.upper
-        within = lower < item <= upper or (item == lower and not self.lower_open)
+        within = self.lower < item <= self.upper or (item == self.lower and not self.lower_open)
         return item if within and abs(item) != math.inf else None
 
     def error(self, value: Any, allowed: str | None = None) -> ConfigurationError:
@@ -161,38 +112,32 @@ class Parameter:
 
 
 class ParameterTable(Mapping[str, Parameter]):
-    """Parameters by name, in the order in which they are declared."""
+    """
+    Parameters by name, in the order in which they are declared.
+
+    `declared` has declarations of parameters that users name, too; iteration leaves them out.
+    """
 
     def __init__(self, *groups: Iterable[Parameter]) -> None:
-        declared = [p for group in groups for p in group]
-        self._by_name = {p.name: p for p in declared if not p.name.endswith(ANY_NAME)}
-        self._families = {
-            p.name.removesuffix(ANY_NAME): p for p in declared if p.name.endswith(ANY_NAME)
-        }
+        self._by_name = {p.name: p for group in groups for p in group}
+        self.declared = tuple(self._by_name.values())
 
     def __getitem__(self, name: str) -> Parameter:
-        family = self._families.get(name.rpartition('.')[0]) if '.' in name else None
-        if family is None or name in self._by_name:
+        if name in self._by_name or '.' not in name:
             return self._by_name[name]
-        if not re.fullmatch('[A-Za-z][A-Za-z0-9_]*', name.rpartition('.')[2]):
-            raise KeyError(name)
-        return replace(family, name=name)
+        family = re.sub(r'\.[A-Za-z][A-Za-z0-9_]*$', ANY_NAME, name)
+        return replace(self._by_name[family], name=name)
 
-    @property
-    def families(self) -> tuple[Parameter, ...]:
-        """Declarations of parameters that users name; iteration leaves them out."""
-        return tuple(self._families.values())
+    def __iter__(self) -> Iterator[str]:
+        return (name for name in self._by_name if not name.endswith(ANY_NAME))
+
+    def __len__(self) -> int:
+        return sum(1 for _ in self)
 
     def part_of(self, values: 'Mapping[str, Any]') -> dict[str, Any]:
         """Return those of `values` that this table declares, in its order."""
-        declared = {name: values[name] for name in self if name in values}
-        return declared | {name: values[name] for name in values if name in self}
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._by_name)
-
-    def __len__(self) -> int:
-        return len(self._by_name)
+        names = [*self, *values]
+        return {name: values[name] for name in names if name in values and name in self}
 
     def defaults(self) -> dict[str, Any]:
         """Return a fresh dictionary of the defaults."""
@@ -217,38 +162,27 @@ class ParameterTable(Mapping[str, Parameter]):
         """
         Check names, types and bounds of `values`; what is absent stays absent.
 
-        ``{'constants': {'k': 3}}`` is the same as ``{'constants.k': 3}``.
-
-        Raises
-        ------
-        ConfigurationError
-            An unknown name (with the closest known one), or a bad value.
-
+        ``{'constants': {'k': 3}}`` is the same as ``{'constants.k': 3}``. Raises
+        ConfigurationError for an unknown name (with the closest known one), or a bad value.
         """
         flat: dict[str, Any] = {}
         for name, value in values.items():
-            if name in self._families and isinstance(value, Mapping):
+            if f'{name}{ANY_NAME}' in self._by_name and isinstance(value, Mapping):
                 flat |= {f'{name}.{key}': number for key, number in value.items()}
             else:
                 flat[name] = value
         for name in flat:
             if name not in self:
-                raise unknown_parameter(name, [*self, *(p.name for p in self.families)])
+                raise unknown_parameter(name, self._by_name)
         return {name: self[name].coerce(value) for name, value in flat.items()}
 
 
 class Parameters(dict[str, Any]):
     """
-    Values of all parameters of a table, checked once and each in its own type; not to be changed.
+    Values of all parameters of a `table`, checked once and each in its own type.
 
     `ParameterTable.complete` makes them where values enter the package. Code that receives them
-    does not check them again.
-
-    Attributes
-    ----------
-    table : ParameterTable
-        What they are the values of.
-
+    neither checks nor changes them.
     """
 
     def __init__(self, table: ParameterTable, checked: dict[str, Any]) -> None:
@@ -269,14 +203,13 @@ class Parameters(dict[str, Any]):
         message says what is `running`, such as 'observer'.
         """
         parameters = self.changed(changes)
-        for name in parameters:
+        for name, value in parameters.items():
             if name not in self:
                 raise unknown_parameter(name, self)
-        for name, value in self.items():
-            if not self.table[name].live and parameters[name] != value:
+            if not self.table[name].live and value != self[name]:
                 raise ConfigurationError(
-                    f"parameter '{name}': can't change in a running {running} (it is {value!r}), "
-                    f'got {parameters[name]!r}'
+                    f"parameter '{name}': can't change in a running {running} (it is "
+                    f'{self[name]!r}), got {value!r}'
                 )
         return parameters
 

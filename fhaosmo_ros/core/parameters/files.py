@@ -7,64 +7,32 @@ from pathlib import Path
 import re
 from typing import Any, TypeVar
 
-from fhaosmo_ros.core.parameters.declaration import (
-    Parameters,
-    ParameterTable,
-    shown,
-    unknown_parameter,
-)
+from fhaosmo_ros.core.parameters.declaration import Parameters, ParameterTable, shown
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
-from fhaosmo_ros.core.parameters.per_channel import (
-    channel_names,
-    CHANNELS,
-    of_named_channel,
-    UNNAMED,
-    with_channels,
-    with_own_parameters,
-)
-from fhaosmo_ros.core.parameters.tables import CHANNEL_PARAMETERS, NODE_TABLES
+from fhaosmo_ros.core.parameters.per_channel import of_named_channel, select
+from fhaosmo_ros.core.parameters.tables import NODE_TABLES
 from fhaosmo_ros.core.parameters.yaml_text import MAX_LENGTH, parse
 import yaml
 
 Made = TypeVar('Made')
 
-BUILT_IN = ('use_sim_time', 'start_type_description_service')
-"""Parameters that rclpy declares itself."""
+MARK = 'ros__parameters'
+"""Key between the name of a node and its parameters."""
 DUMPER = getattr(yaml, 'CSafeDumper', yaml.SafeDumper)
 """libyaml's dumper is about ten times as fast: a node writes its parameters between samples."""
-
-
-def is_built_in(name: str) -> bool:
-    """Return True for a parameter that is rclpy's, not ours."""
-    return name in BUILT_IN or name.startswith('qos_overrides.')
 
 
 def load(
     path: str | Path, node: str, table: ParameterTable | None = None, strict: bool = False
 ) -> dict[str, Any]:
     """
-    Return what a parameter file sets for a node of this package.
+    Return what a parameter file sets for a node of this package, by name, checked and typed.
 
-    Sections that match the node's name are merged in the order of the file, as rcl does. One
-    ``/**`` section may serve both nodes, so names that only another node of the package declares
-    are ignored.
-
-    Parameters
-    ----------
-    path : path
-        A YAML file of the form ``name: {ros__parameters: {...}}``.
-    node : str
-        'estimator' or 'plant', or a full name such as '/rig/estimator'.
-    table : ParameterTable, optional
-        What the node declares; without it, that of the last part of its name.
-    strict : bool
-        Raise if no section is the node's. ROS ignores such a file; here it is ignored unless a
-        section's name looks like a misspelt one of the node.
-
-    Returns
-    -------
-    dict
-        Values by name, checked and in the parameters' own types.
+    `node` is 'estimator', 'plant' or 'arm', or a full name such as '/rig/estimator'; `table` is
+    what it declares, if not that of the last part of its name. Sections that match the node's name
+    are merged in the order of the file, as rcl does. One ``/**`` section may serve several nodes,
+    so names that only another node of the package declares are ignored. A file without a section
+    for the node is ignored, as by ROS, unless a name looks like a misspelt one, or if `strict`.
 
     Raises
     ------
@@ -89,7 +57,7 @@ def dumps(values: Mapping[str, Any], node: str = '/**') -> str:
     """Return the text of a file that sets values of Python's own types for nodes of that name."""
     # Copies of the lists: PyYAML writes an alias where one list comes twice, and ROS reads none.
     copied = {name: list(v) if isinstance(v, list) else v for name, v in values.items()}
-    content = {node: {'ros__parameters': copied}}
+    content = {node: {MARK: copied}}
     text = yaml.dump(content, Dumper=DUMPER, sort_keys=False, default_flow_style=None, width=99)
     return str(text)
 
@@ -109,86 +77,18 @@ def read(path: str | Path, node: str, strict: bool = False) -> dict[str, Any]:
     raise ConfigurationError(f'{path}: {problem}')
 
 
-def _of_node(text: str, node: str, strict: bool) -> dict[str, Any]:
-    """Return the parameters in the sections of a text that are a node's."""
-    content = parse(text)
-    sections: dict[str, dict[str, Any]] = {}
-    if isinstance(content, Mapping):
-        _collect(content, '', sections)
-    if not sections:
-        raise ConfigurationError(
-            "expected 'NODE: {ros__parameters: {...}}' (NODE is a node's name or /**), "
-            f'got {shown(content)}'
-        )
-    ours = [section for section in sections if _matches(section, node)]
-    names = [section.lstrip('/') for section in sections]
-    if not ours and (strict or any(_misspells(name, node) for name in names)):
-        raise ConfigurationError(f"expected a section '{node}' or '/**', got {', '.join(names)}")
-    return {name: value for section in ours for name, value in sections[section].items()}
-
-
-def select(values: Mapping[str, Any], table: ParameterTable) -> dict[str, Any]:
-    """
-    Check `values` and return those of `table`, leaving out other nodes' and rclpy's own.
-
-    Raises
-    ------
-    ConfigurationError
-        A name that no node of the package declares, or a bad value.
-
-    """
-    names = channel_names(values)
-    estimator = with_channels(with_own_parameters(names, values))
-    if CHANNELS in table:
-        table = estimator
-    tables = [table, estimator, *NODE_TABLES.values()]
-    for name in values:
-        if not any(name in other for other in tables) and not is_built_in(name):
-            raise unknown_parameter(name, dict.fromkeys(n for other in tables for n in other))
-    return {
-        name: names if name == CHANNELS else table[name].coerce(value)
-        for name, value in values.items()
-        if name in table
-    }
-
-
-def complete(values: Mapping[str, Any], table: ParameterTable) -> Parameters:
-    """
-    Check what files and the command line set for a node, each value once; see `select`.
-
-    The channels' own parameters are among the result; they default to the common values.
-    """
-    checked = select(values, table)
-    channels = with_own_parameters(checked.get(CHANNELS, UNNAMED), checked)
-    common = table.defaults() | checked
-    own = {
-        f'{channel}.{name}': value
-        for channel in filter(None, channels)
-        for name, value in common.items()
-        if name in CHANNEL_PARAMETERS
-    }
-    return Parameters(with_channels(channels) if own else table, own | checked)
-
-
 def make_from_file(
     make: Callable[[Parameters], Made], path: str | Path, node: str, channel: str
 ) -> Made:
     """
     Return what `make` makes of the parameters that a file sets for a channel of an estimator.
 
-    The channel of a node that has a single one is called ''.
-
-    Raises
-    ------
-    ConfigurationError
-        As `load` and `make`, no section of the node, or a channel that it does not have.
-
+    The channel of a node that has a single one is called ''. Raises ConfigurationError as `load`
+    and `make`, for a file without a section of the node, or without the channel.
     """
-    table = NODE_TABLES['estimator']
-    values = load(path, node, table, strict=True)
+    values = load(path, node, NODE_TABLES['estimator'], strict=True)
     try:
-        own = of_named_channel(values, channel, 'channel')
-        return make(Parameters(table, table.part_of(own)))
+        return make(of_named_channel(values, channel, 'channel'))
     except ConfigurationError as error:
         raise ConfigurationError(f'{path}: {error}') from None
 
@@ -199,60 +99,50 @@ def with_origin(
     """
     Return the error with the file in front that has set the parameter which it names.
 
-    Parameters
-    ----------
-    error : ConfigurationError
-    origins : mapping
-        File (or another source) of each value by name; None for the command line.
-    channel : str
-        The channel that the error is about, where its text does not say it.
-
+    `origins` has the file, or another source, of each value by name, None for the command line;
+    `channel` is what the error is about, where its text does not say it.
     """
     found = re.match(r"(?:channel '([^']+)': )?(?:unknown )?parameter '([^']+)'", str(error))
     if not found:
         return error
-    name = found[2]
-    origin = origins.get(f'{found[1] or channel}.{name}', origins.get(name))
+    origin = origins.get(f'{found[1] or channel}.{found[2]}', origins.get(found[2]))
     return ConfigurationError(f'{origin}: {error}') if origin else error
 
 
-def _collect(content: Mapping[Any, Any], name: str, out: dict[str, dict[str, Any]]) -> None:
-    """Add the sections below `name`, and their parameters by their dotted names."""
-    section = name.replace('//', '/')
-    for key, value in content.items():
-        if not isinstance(value, Mapping):
-            place = f"parameters below ros__parameters of section '{section}'"
-            if key != 'ros__parameters':
-                place = f"ros__parameters below '{section or key}'"
-            raise ConfigurationError(f'expected {place}, got {shown(key)}: {shown(value)}')
-        if key != 'ros__parameters':
-            _collect(value, f'{name}/{key}', out)
-            continue
-        parameters = out.setdefault(name, {})
-        for parameter, setting in _flat(value):
-            if parameter in parameters:
-                raise ConfigurationError(f"section '{section}': '{parameter}' is set twice")
-            parameters[parameter] = setting
-
-
-def _flat(values: Mapping[Any, Any], prefix: str = '') -> Iterator[tuple[str, Any]]:
-    """Yield parameters by their dotted names: ``hip: {lambda: 3}`` is ``hip.lambda``."""
-    for key, value in values.items():
-        if isinstance(value, Mapping):
-            yield from _flat(value, f'{prefix}{key}.')
-        else:
-            check_one_type(f'{prefix}{key}', value)
-            yield f'{prefix}{key}', value
-
-
-def check_one_type(name: str, value: Any) -> None:
-    """Refuse what rcl refuses, in words that help."""
-    if isinstance(value, list) and len({type(item) for item in value}) > 1:
-        kinds = ' and '.join(sorted({type(item).__name__ for item in value}))
+def _of_node(text: str, node: str, strict: bool) -> dict[str, Any]:
+    """Return the parameters in the sections of a text that are a node's."""
+    sections: dict[str, dict[str, Any]] = {}
+    for keys, value in _leaves(parse(text)):
+        if MARK not in keys or (keys[-1] == MARK and value != {}):
+            place = f'{shown("/".join(keys).replace("//", "/"))}: ' if keys else ''
+            raise ConfigurationError(
+                f"expected 'NODE: {{{MARK}: {{...}}}}' (NODE is a node's name or /**), "
+                f'got {place}{shown(value)}'
+            )
+        mark = keys.index(MARK)
+        section, name = '/'.join(keys[:mark]), '.'.join(keys[mark + 1 :])
+        parameters = sections.setdefault(section, {})
+        if name in parameters:
+            raise ConfigurationError(f"section '{section}': '{name}' is set twice")
+        if value != {}:
+            parameters[name] = value
+    if not any(_matches(section, node) for section in sections) and (
+        strict or any(_misspells(section, node) for section in sections)
+    ):
         raise ConfigurationError(
-            f"parameter '{name}': expected a list of one type (write 15.0, or quote '0'), "
-            f'got {kinds} mixed: {shown(value)}'
+            f"expected a section '{node}' or '/**', got {', '.join(sections)}"
         )
+    ours = [values for section, values in sections.items() if _matches(section, node)]
+    return {name: value for values in ours for name, value in values.items()}
+
+
+def _leaves(content: Any, keys: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
+    """Yield what is no mapping, or an empty one, with the keys on the way to it."""
+    if not isinstance(content, Mapping) or not content:
+        yield keys, content
+        return
+    for key, value in content.items():
+        yield from _leaves(value, (*keys, str(key)))
 
 
 def _misspells(section: str, node: str) -> bool:

@@ -8,13 +8,12 @@ YAML checks, ROS descriptors, docs/parameters.md and error messages derive from 
 from fhaosmo_ros.core.parameters.arm import ARM, ARM_NODE
 from fhaosmo_ros.core.parameters.declaration import Parameter, ParameterTable
 
-MAX_ORDER = 12
 CONSTANTS = 'constants.'
 """Begin of the names of constants in expressions."""
 PER_LEVEL = '1 or N'
 
 MODEL = (
-    Parameter('order', 3, 'Number n of states of the model.', lower=1, upper=MAX_ORDER,
+    Parameter('order', 3, 'Number n of states of the model.', lower=1, upper=12,
               live=False),
     Parameter('phi', ['0', '0', '-z3'],
               "The functions Phi_i of z_i' = z_{i+1} + Phi_i. Phi_i may use z1 .. zi, the known "
@@ -308,10 +307,9 @@ PLANT_NODE = (
 
 OBSERVER_PARAMETERS = ParameterTable(MODEL, OBSERVER)
 ONLINE_PARAMETERS = ParameterTable(MODEL, OBSERVER, SAMPLING, EVENTS)
-CHANNEL = (*MODEL, *OBSERVER, *SAMPLING, *EVENTS, *INPUT, *CHANNEL_OUTPUT)
-CHANNEL_PARAMETERS = ParameterTable(CHANNEL)
+CHANNEL_PARAMETERS = ParameterTable(MODEL, OBSERVER, SAMPLING, EVENTS, INPUT, CHANNEL_OUTPUT)
 """What each channel of an estimator node may have for itself."""
-ESTIMATOR_PARAMETERS = ParameterTable(CHANNEL, ESTIMATOR_NODE, DIAGNOSTICS)
+ESTIMATOR_PARAMETERS = ParameterTable(CHANNEL_PARAMETERS.declared, ESTIMATOR_NODE, DIAGNOSTICS)
 PLANT_PARAMETERS = ParameterTable(MODEL, PLANT_MODEL)
 PLANT_NODE_PARAMETERS = ParameterTable(MODEL, PLANT_MODEL, PLANT_NODE)
 ARM_NODE_PARAMETERS = ParameterTable(ARM, ARM_NODE, DIAGNOSTICS[:2])

@@ -9,8 +9,7 @@ from typing import Any
 from fhaosmo_ros.core.parameters import per_channel
 from fhaosmo_ros.core.parameters.declaration import Parameters, Value
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
-from fhaosmo_ros.core.parameters.files import complete
-from fhaosmo_ros.core.parameters.per_channel import CHANNELS, FROM_JOINTS, of_channel
+from fhaosmo_ros.core.parameters.per_channel import CHANNELS, complete, FROM_JOINTS, of_channel
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
 from fhaosmo_ros.inputs import measured_output, with_joints
 from fhaosmo_ros.messages.fields import listed
@@ -66,7 +65,7 @@ class EstimatorNode(ManagedNode):
         values = self.values
         names: list[str] = values[CHANNELS]
         if names == FROM_JOINTS:  # which joints there are is not known yet, but some may be named
-            names = [*names, *per_channel.with_own_parameters(names, values)]
+            names = [*names, *per_channel.channels_with_own(values)]
         channels, inputs, estimates = [], [], []
         for name in names:
             with naming_channel(name):
@@ -153,7 +152,7 @@ class EstimatorNode(ManagedNode):
         fit = fit[:most]
         if not fit:
             return
-        for name in set(per_channel.with_own_parameters(present[CHANNELS], present)) - set(fit):
+        for name in set(per_channel.channels_with_own(present)) - set(fit):
             log.error(f"parameters of '{name}' are not used: there is no such joint")
         values = complete({
             **{k: v for k, v in present.items() if (per_channel.split(k)[0] or fit[0]) in fit},

@@ -10,14 +10,14 @@ from typing import Any
 
 from fhaosmo_ros.core.parameters.declaration import shown, unknown_parameter
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
-from fhaosmo_ros.core.parameters.files import check_one_type, is_built_in, read
+from fhaosmo_ros.core.parameters.files import read
+from fhaosmo_ros.core.parameters.per_channel import is_built_in
 from fhaosmo_ros.core.parameters.tables import NODE_TABLES
 from fhaosmo_ros.core.parameters.yaml_text import parse
 from rclpy.logging import get_logger
 from rclpy.utilities import remove_ros_args
 
 USAGE = '[--ros-args [--params-file FILE] [-p NAME:=VALUE] [-r FROM:=TO] ...]'
-INDENT = ' ' * 4
 Origins = dict[str, str | None]
 """By the name of a parameter: the file that sets it, None for the command line."""
 
@@ -60,11 +60,9 @@ def read_arguments(name: str, argv: list[str]) -> tuple[dict[str, Any], Origins,
         if not (is_built_in(parameter) or '.' in parameter or parameter in table):
             raise unknown_parameter(parameter, table)
         try:
-            value = parse(text)
+            given[parameter], origins[parameter] = parse(text), None
         except ConfigurationError as error:
             raise ConfigurationError(f"parameter '{parameter}': {error}") from None
-        check_one_type(parameter, value)
-        given[parameter], origins[parameter] = value, None
     others = remove_ros_args([name, *(rest if of_ros else argv)])[1:]
     if others:
         raise ConfigurationError(
@@ -75,20 +73,18 @@ def read_arguments(name: str, argv: list[str]) -> tuple[dict[str, Any], Origins,
 
 def _full_name(name: str, arguments: list[str]) -> str:
     """Return the node's name after the renaming that the command line asks for."""
-    parts = {'node': name, 'ns': ''}
+    namespace = ''
     for flag, word in pairwise(arguments):
         rule = re.fullmatch(r'(?:[^:]+:)?__(node|name|ns):=(.+)', word)
         if flag in ('-r', '--remap') and rule:
-            parts['ns' if rule[1] == 'ns' else 'node'] = rule[2]
-    return f'{parts["ns"].rstrip("/")}/{parts["node"]}'
+            namespace, name = (rule[2], name) if rule[1] == 'ns' else (namespace, rule[2])
+    return f'{namespace.rstrip("/")}/{name}'
 
 
 def help_of(name: str) -> str:
     """Return the help of a node: all parameters, with their defaults and what is allowed."""
     lines = [f'usage: {name} {USAGE}', '', 'Parameters and their defaults:', '']
-    table = NODE_TABLES[name]
-    for p in [*table.values(), *table.families]:
+    for p in NODE_TABLES[name].declared:
         lines.append(f'{p.name}: {shown(p.default)}')
-        text = f'{p.text} ({p.allowed})'
-        lines += textwrap.wrap(text, 99, initial_indent=INDENT, subsequent_indent=INDENT)
+        lines += textwrap.wrap(f'    {p.text} ({p.allowed})', 99, subsequent_indent=' ' * 4)
     return '\n'.join(lines)

@@ -87,7 +87,7 @@ class ReportLog:
             kind = re.sub(r'[-+.\d]+', '', text)  # numbers are others each time
             before, self._latest[report.task] = self._latest.get(report.task), kind
             if report.level != OK and kind != before and kind not in self._quiet:
-                if report.level == ERROR:
+                if report.level == ERROR:  # rclpy wants a line of its own for each severity
                     self._logger.error(text)
                 else:
                     self._logger.warning(text)

@@ -92,10 +92,8 @@ def check_overrides(
     `published` and `subscribed` are all topics whose publishers and subscriptions the node makes
     `OVERRIDABLE`.
     """
-    endpoints = [
-        *(f'{full_name(node, topic)}.publisher' for topic in published),
-        *(f'{full_name(node, topic)}.subscription' for topic in dict.fromkeys(subscribed)),
-    ]
+    endpoints = [f'{full_name(node, topic)}.publisher' for topic in published]
+    endpoints += [f'{full_name(node, t)}.subscription' for t in dict.fromkeys(subscribed)]
     policies = {policy.name.lower(): allowed for policy, allowed in POLICIES.items()}
     for name, value in node.given.items():
         if not name.startswith(OVERRIDES) or name.startswith(OF_RCLPY):
@@ -118,19 +116,14 @@ def subscribe_with_info(
     qos: QoSProfile,
     **options: Any,
 ) -> Any:
-    """
-    Subscribe with a callback that takes the message and its info; `options` are those of rclpy.
-
-    rclpy delivers the info if the callback's signature has two parameters. The events executor of
-    rclpy 7.1 passes both as one tuple, the other executors as two arguments; the adapter takes
-    either.
-    """
+    """Subscribe with a callback that takes the message and its info; `options` are of rclpy."""
 
     def adapter(message: Any, info: Any = None) -> None:
-        if info is None:
+        if info is None:  # the events executor of rclpy 7.1 passes both as one tuple
             message, info = message
         callback(message, info)
 
+    # rclpy delivers the info if the signature has two parameters.
     adapter.__signature__ = inspect.signature(lambda message, info: None)  # type: ignore[attr-defined]
     return node.create_subscription(
         message_type, topic, adapter, qos,
@@ -163,7 +156,6 @@ def set_period(timer: Timer, seconds: float) -> None:
     """Change a timer's period; a timer that is cancelled stays so."""
     period = round(seconds * 1e9)
     if period != timer.timer_period_ns:
-        waits = not timer.is_canceled()
         timer.timer_period_ns = period
-        if waits:
+        if not timer.is_canceled():
             timer.reset()  # else the events executor waits for the end of the old period

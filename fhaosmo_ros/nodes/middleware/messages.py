@@ -47,18 +47,12 @@ def time_message(stamp: int, message: Time | None = None) -> Time:
 
 def message_class(name: str) -> Any:
     """
-    Return the class of a message type, such as 'std_msgs/msg/Float64'.
+    Return the class of a message type, such as 'std_msgs/msg/Float64', or raise LookupError.
 
     Names come from bags and from the network, and importing a module runs its code. So a package
     is imported only from where interface packages are installed: the environment's site-packages,
     or those of a sourced workspace (AMENT_PREFIX_PATH). One that lies in the working directory,
     for instance beside the bag, is not.
-
-    Raises
-    ------
-    LookupError
-        No such message type is installed.
-
     """
     found = re.fullmatch(r'([a-z][a-z0-9_]*)/msg/([A-Z][A-Za-z0-9]*)', name)
     if found and _is_installed(found[1]):
@@ -88,13 +82,11 @@ def definitions(message_type: str) -> dict[str, Any]:
     """Return the definitions, as `find_field` reads them, of a message type and all in it."""
     found: dict[str, Any] = {}
     waiting = [message_type]
-    while waiting:
-        name = waiting.pop()
-        if name in found:
-            continue
-        kind = message_class(name)
-        fields = zip(kind.get_fields_and_field_types(), kind.SLOT_TYPES, strict=True)
-        found[name] = [], [(field, _node(its, waiting)) for field, its in fields]
+    for name in waiting:
+        if name not in found:
+            kind = message_class(name)
+            fields = zip(kind.get_fields_and_field_types(), kind.SLOT_TYPES, strict=True)
+            found[name] = [], [(field, _node(its, waiting)) for field, its in fields]
     return found
 
 

@@ -1,20 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
 """What every node is: its parameters, declared in the core, become those of ROS, also live."""
 
-from collections.abc import Callable, Iterable, Mapping
-from functools import partial
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from fhaosmo_ros.core.parameters.declaration import Parameter, Parameters, shown, suggestion
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
-from fhaosmo_ros.core.parameters.files import BUILT_IN, complete, is_built_in
-from fhaosmo_ros.core.parameters.per_channel import followers
+from fhaosmo_ros.core.parameters.per_channel import BUILT_IN, complete, is_built_in, split
 from fhaosmo_ros.core.parameters.tables import NODE_TABLES
-from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor
 from rclpy.exceptions import ParameterNotDeclaredException
 from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 from rosgraph_msgs.msg import Clock
+
+STEPS = 100.0
+"""Of a slider: none where one of them would exceed the default, as bounds then say nothing."""
 
 
 class RefusedError(ParameterNotDeclaredException):
@@ -35,25 +36,20 @@ def descriptor(parameter: Parameter, read_only: bool) -> ParameterDescriptor:
     Typing is dynamic so that a wrong type reaches our own check, whose message names the
     parameter. Bounds are a ROS range only where a slider of rqt_reconfigure makes sense.
     """
-    fixed = not parameter.live and not read_only
-    constraints = (
-        parameter.allowed,
-        parameter.lengths,
-        'fixed while the node is configured: set it after cleanup' if fixed else '',
-    )
+    constraints = [parameter.allowed, *filter(None, [parameter.lengths])]
+    if not (parameter.live or read_only):
+        constraints.append('fixed while the node is configured: set it after cleanup')
     result = ParameterDescriptor(
         name=parameter.name,
         type=RosParameter.Type.from_parameter_value(parameter.default).value,
         description=parameter.text,
-        additional_constraints='; '.join(filter(None, constraints)),
+        additional_constraints='; '.join(constraints),
         read_only=read_only,
         dynamic_typing=True,
     )
-    bounds = {'from_value': parameter.lower, 'to_value': parameter.upper}
-    if parameter.slider and parameter.kind == 'double':
-        result.floating_point_range = [FloatingPointRange(**bounds)]
-    elif parameter.slider:
-        result.integer_range = [IntegerRange(**bounds)]
+    lower, upper = parameter.lower, parameter.upper
+    if parameter.kind == 'double' and upper - lower <= STEPS * parameter.default:
+        result.floating_point_range = [FloatingPointRange(from_value=lower, to_value=upper)]
     return result
 
 
@@ -63,8 +59,7 @@ def built_in(given: Mapping[str, Any]) -> list[RosParameter]:
     for name, value in own.items():
         flag = name in BUILT_IN
         if not isinstance(value, bool if flag else bool | int | float | str):
-            expected = 'true or false' if flag else 'one value'
-            problem = f'expected {expected}, got {shown(value)}'
+            problem = f'expected {"true or false" if flag else "one value"}, got {shown(value)}'
             raise ConfigurationError(f"parameter '{name}': {problem}")
     return [RosParameter(name, value=value) for name, value in own.items()]
 
@@ -100,19 +95,18 @@ class BaseNode(Node):
         self, msg_type: Any, topic: str, callback: Any, *arguments: Any, **options: Any
     ) -> Any:
         """Return a subscription; that of /clock, which rclpy makes, passes over negative times."""
-        if msg_type is Clock:
-            callback = partial(self._take_time, callback)
-        return super().create_subscription(msg_type, topic, callback, *arguments, **options)
 
-    def _take_time(self, take: Callable[[Clock], None], message: Clock) -> None:
-        """Take a time that is not negative: in rclpy 7.1 such a one ends the node."""
-        if message.clock.sec >= 0:
-            take(message)
-            return
-        self.get_logger().warning(
-            f'rejected a time on /clock: expected seconds >= 0, got {message.clock.sec}',
-            throttle_duration_sec=5.0,
-        )
+        def take_time(message: Clock) -> None:
+            if message.clock.sec >= 0:  # else rclpy 7.1 ends the node
+                callback(message)
+                return
+            self.get_logger().warning(
+                f'rejected a time on /clock: expected seconds >= 0, got {message.clock.sec}',
+                throttle_duration_sec=5.0,
+            )
+
+        take = take_time if msg_type is Clock else callback
+        return super().create_subscription(msg_type, topic, take, *arguments, **options)
 
     def extend(self, values: Parameters) -> None:
         """Go on with values, perhaps of a larger table: what is new is declared."""
@@ -133,9 +127,10 @@ class BaseNode(Node):
             return parameters
         try:
             changes = {name: table[name].coerce(found[name].value) for name in ours}
-            for name in ours:
-                for own in followers(name, self.values):
-                    changes.setdefault(own, changes[name])
+            for own, value in self.values.items():  # of a channel, while it is the common value
+                common = split(own)[1]
+                if common in changes and value == self.values[common]:
+                    changes.setdefault(own, changes[common])
             values = Parameters(table, {**self.values, **changes})
             self._next = values, changes, self._prepare(values, changes)
         except ConfigurationError as error:

@@ -41,9 +41,8 @@ class Spinner:
     Runs a node in a thread of its own while it is open, then destroys it and ends its context.
 
     The usual main (`rclpy.init`, ``executor.spin()``, except KeyboardInterrupt) hangs on SIGINT
-    with the events executor of rclpy 7.1. So the executor spins in this thread until a future is
-    done; the main thread waits for signals, because Python runs signal handlers there only; `wake`
-    makes the executor look at the future.
+    with the events executor of rclpy 7.1. So that spins here until a future is done, at which
+    `wake` makes it look, and the main thread waits for signals: Python runs handlers there only.
 
     `on_end` is called in that thread when it ends, also by the `error` that a callback raised. At
     the end a callback has `grace` seconds to end, or the node stays; None: as long as it takes.
@@ -73,15 +72,11 @@ class Spinner:
         self._stop.set_result(None)
         self._executor.wake()
         self._thread.join(timeout=self.grace)
+        self.stuck = self._thread.is_alive()  # a callback is still running
         if not self.stuck:
             self._executor.shutdown()
             self.node.destroy_node()
             rclpy.try_shutdown(context=self.node.context)
-
-    @property
-    def stuck(self) -> bool:
-        """True if a callback is still running after the end of the block."""
-        return self._thread.is_alive()
 
     def _spin(self) -> None:
         try:

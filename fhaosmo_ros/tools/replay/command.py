@@ -16,8 +16,8 @@ from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.online.events import Event
 from fhaosmo_ros.core.parameters.declaration import Parameters, ParameterTable
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
-from fhaosmo_ros.core.parameters.files import read, select, with_origin
-from fhaosmo_ros.core.parameters.per_channel import of_named_channel
+from fhaosmo_ros.core.parameters.files import read, with_origin
+from fhaosmo_ros.core.parameters.per_channel import of_named_channel, select
 from fhaosmo_ros.core.parameters.tables import (
     CHANNEL_PARAMETERS,
     ESTIMATOR_PARAMETERS,
@@ -119,7 +119,7 @@ def make_estimator(
     except ConfigurationError as error:
         raise with_origin(error, origins) from None
     own = of_named_channel(with_joints(values), arguments.channel, '--channel')
-    parameters = CHANNEL_PARAMETERS.complete(Parameters(ESTIMATOR_PARAMETERS, own))
+    parameters = CHANNEL_PARAMETERS.complete(own)
     if arguments.bag.suffix == '.csv':  # it says where y and u are, not the topics of a node
         parameters = parameters.changed(ParameterTable(INPUT).defaults())
     if arguments.smooth:

@@ -27,9 +27,7 @@ from fhaosmo_ros.tools.tuning.tuner import simulated, TUNE_PARAMETERS, Tuner
 import numpy as np
 
 SMALL_CORRELATION, UNLIKELY = 0.05, 0.01
-BOTH = ParameterTable(
-    TUNE_PARAMETERS.values(), ESTIMATOR_PARAMETERS.values(), ESTIMATOR_PARAMETERS.families
-)
+BOTH = ParameterTable(TUNE_PARAMETERS.declared, ESTIMATOR_PARAMETERS.declared)
 Found = tuple[dict[str, Any], str]
 """Parameters of the estimator, and a report of them."""
 
