@@ -57,7 +57,7 @@ TUNING = (
           'Weight of the error of each estimate, squared and relative to the RMS of its truth.',
           lower=0.0, upper=1e9, lengths='1 (d alone) or n + 1 (z1 .. zn, d)'),
 )  # fmt: skip
-TUNE_PARAMETERS = ParameterTable(FAMILY_PARAMETERS.values(), FAMILY_PARAMETERS.families, TUNING)
+TUNE_PARAMETERS = ParameterTable(FAMILY_PARAMETERS.declared, TUNING)
 """All that `tune` takes beside the estimator's parameters."""
 FIRST_STAMP = 1_000_000_000  # ns, of a recording's first sample; 0 is that of a stamp not set
 SMALLEST = 1e-12  # smaller relative errors count as this one: their logarithm is finite
