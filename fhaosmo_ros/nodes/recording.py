@@ -99,7 +99,8 @@ class TopicRecorder(PrivateNode):
         ros_arguments: Sequence[str] = (),
     ) -> None:
         super().__init__('fhaosmo_recorder', ros_arguments)
-        self.counts, self.problems = Counter[str](), list[str]()
+        self.counts: Counter[str] = Counter()
+        self.problems: list[str] = []
         self._bag, self._everything, self._begin = bag, everything, time_ns()
         resolved = self.node.resolve_topic_name  # after remapping; names of nodes, too
         self._nodes = list(map(resolved, nodes))

@@ -67,14 +67,29 @@ cdef struct Settings:
 
 
 cdef struct Counts:
-    # One number for each case of docs/node.md, in whose tables they are.
-    long long accepted
-    # Samples of y that were not used:
-    long long rejected_measurements, rejected_spikes, rejected_stuck, rejected_steps
-    long long duplicate_stamps, backward_stamps, zero_stamps, far_stamps
+    # One number for each case of docs/node.md.
+    long long accepted  # samples used
+    # Samples that were not used:
+    long long rejected_measurements  # y was NaN, infinite or beyond 1e60
+    long long rejected_spikes  # beyond spike_gate, or 6 usual deviations, from its prediction
+    long long rejected_stuck  # it was unchanged for stuck_time, or repeated although it has noise
+    long long rejected_steps  # the step would have left the finite numbers
+    long long duplicate_stamps  # the stamp of the sample before
+    long long backward_stamps  # older than the sample before, by at most max_gap
+    long long zero_stamps  # no time yet: before the first /clock, an unset header
+    long long far_stamps  # more than max_gap from the one before: the next sample decides
     # What else has happened:
-    long long rejected_inputs, gaps, sub_steps, spread_stamps, bursts, spikes_believed, stuck
-    long long restarts_forward, restarts_backward, divergences, jumps
+    long long rejected_inputs  # u was NaN or infinite; the one before is held
+    long long gaps  # intervals of more than twice the mean that were bridged in sub-steps
+    long long sub_steps  # that these took
+    long long spread_stamps  # at the clock time of the one before: spread
+    long long bursts  # samples within a tenth of the mean interval after the one before
+    long long spikes_believed  # five samples in a row were beyond the gate: a real step of y
+    long long stuck  # times that y began to be stuck
+    long long restarts_forward  # after a gap longer than max_gap, or a clock that jumped forward
+    long long restarts_backward  # after a clock that jumped back
+    long long divergences  # times that y was lost, and the observer was restarted from it
+    long long jumps  # times that y alone jumped, and the other estimates went on (D 23, D 35)
 
 
 cdef Counts NOTHING
@@ -89,7 +104,11 @@ class Counters(namedtuple('Counters', COUNTERS)):
     @property
     def rejected(self):
         """Samples of y that were not used."""
-        return sum(self[1:9])
+        return (
+            self.rejected_measurements + self.rejected_spikes + self.rejected_stuck
+            + self.rejected_steps + self.duplicate_stamps + self.backward_stamps
+            + self.zero_stamps + self.far_stamps
+        )
 
     @property
     def restarts(self):

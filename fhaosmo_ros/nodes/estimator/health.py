@@ -17,11 +17,12 @@ WINDOW = 5
 NANOSECONDS = 1e-9
 BAD_SHARE = 0.5
 """Share of samples lost or rejected that is an error; any at all deserves a warning."""
-GAMMA_AWAY, RATE_RATIO, SPREAD = 0.2, 1.5, 3.0
-"""
-What deserves one, too: a distance of gamma from where it began, a factor between the rate of y and
-that of the gains, and one between the innovations and those expected.
-"""
+GAMMA_AWAY = 0.2
+"""Distance of gamma from where it began that deserves a warning."""
+RATE_RATIO = 1.5
+"""Factor between the rate of y and that of the gains that deserves one."""
+SPREAD = 3.0
+"""Factor between the innovations and those expected that deserves one."""
 UNUSED = {
     'samples lost': '{n} samples lost: they did not arrive, or were damaged',
     'rejected measurements': '{n} samples rejected: y was NaN, infinite or beyond 1e60',

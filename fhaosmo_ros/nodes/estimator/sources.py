@@ -70,12 +70,15 @@ class Source:
 
     def __init__(self, node: Node, sources: 'Sources', topic: str) -> None:
         self._node, self._sources, self.topic = node, sources, topic
-        self.message_type = self._header = ''  # the latter: its name in a message
-        self.heard, self.unheard = list[str](), list[str]()
+        self.message_type = ''
+        self.heard: list[str] = []
+        self.unheard: list[str] = []
         self.numbers, self.offset = endpoints.SequenceNumbers(), 0
         self.delay = self._delay = -math.inf
         self.on_names: Callable[[Any], None] | None = None
-        self.listeners, self._served = list[Listener](), list[Listener]()  # those with a field
+        self.listeners: list[Listener] = []
+        self._served: list[Listener] = []  # those with a field
+        self._header = ''  # its name in a message
         self._subscription: Any = None
 
     def open(self) -> bool:
