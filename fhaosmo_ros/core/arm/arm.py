@@ -318,7 +318,11 @@ class Arm:
         """
         Estimate from arrays: t (K,) in s, q, effort and velocity (K, n).
 
-        Raises ConfigurationError for arrays of other sizes.
+        Raises
+        ------
+        ConfigurationError
+            Arrays of other sizes.
+
         """
         stamps = np.round(np.asarray(t, dtype=np.float64) * 1e9).astype(np.int64)
         shape = len(stamps), len(self.joints)
@@ -339,14 +343,18 @@ class Arm:
         """
         Return the wrench at the origin of a frame that would make the estimated torque.
 
-        Damped least squares, weighted by the covariance of the torque. Raises ConfigurationError
-        for an unknown frame.
+        Damped least squares, weighted by the covariance of the torque.
 
         Returns
         -------
         (6,) array, bool
             Force in N and torque in N m along the frame's axes; True if part of them cannot be
             seen in this posture.
+
+        Raises
+        ------
+        ConfigurationError
+            An unknown frame.
 
         """
         jacobian = self.model.frame_jacobian(estimate.position, frame)

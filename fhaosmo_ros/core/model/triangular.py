@@ -119,7 +119,13 @@ class TriangularModel:
         """
         Return the expressions with the model of the unknown input behind those of the states.
 
-        It is Phi_i = -decay z_i (1/s) of the levels i = n + 1 .. n + 1 + derivatives (D 17).
+        Parameters
+        ----------
+        decay : float
+            kappa in Phi_i = -kappa z_i of every z_i with i > n (1/s, D 17).
+        derivatives : int
+            k: levels n + 1 .. n + 1 + k.
+
         """
         levels = range(self.order + 1, self.order + 2 + derivatives)
         behind = [parse(f'-{decay!r} * z{i}', i) if decay > 0.0 else [] for i in levels]

@@ -196,8 +196,16 @@ class OnlineEstimator:
         """
         Go on where an estimator with the same model and delays was; parameters and counters stay.
 
-        Raises ConfigurationError, and changes nothing, where something is missing, of another
-        size, or out of its range.
+        Parameters
+        ----------
+        values : mapping
+            As `state_dict` returns them.
+
+        Raises
+        ------
+        ConfigurationError
+            Something is missing, of another size, or out of its range. Then nothing has changed.
+
         """
         version = checked(values, {'version': VERSION})['version']
         if version != VERSION:

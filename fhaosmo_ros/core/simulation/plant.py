@@ -59,7 +59,11 @@ class Plant:
         """
         Change live parameters from now on; all or nothing.
 
-        Raises ConfigurationError for an unknown name, a bad value, or one that can't change live.
+        Raises
+        ------
+        ConfigurationError
+            An unknown name, a bad value, or a parameter that can't change live.
+
         """
         self.adopt(self.prepare(changes), 'noise_seed' in changes)
 
@@ -79,9 +83,19 @@ class Plant:
 
     def advance(self, t: float, u: ArrayLike = 0.0) -> None:
         """
-        Integrate up to the time `t` (s since the start), with known inputs (m,) held.
+        Integrate up to the time `t` (s since the start), with known inputs held.
 
-        Raises ConfigurationError for a time that is not finite, or another number of inputs.
+        Parameters
+        ----------
+        t : float
+        u : number or (m,) array
+            Known inputs.
+
+        Raises
+        ------
+        ConfigurationError
+            A time that is not finite, or another number of inputs.
+
         """
         self._system.advance(t, known_inputs(u, self.model.inputs)[np.newaxis])
 
