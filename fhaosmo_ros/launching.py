@@ -17,8 +17,10 @@ ESTIMATOR = {
 COMMON = {
     'namespace': ('', 'namespace of what is started'),
     'use_sim_time': ('false', 'take the time from /clock'),
-    'log_level': ('info', 'least severity that is logged: debug, info, warn, error, fatal'),
+    'log_level': ('info', 'least severity that is logged'),
 }
+CHOICES = {'log_level': ['debug', 'info', 'warn', 'error', 'fatal']}
+"""Arguments that may have some values only."""
 OF_LAUNCH = ('params_file', 'namespace', 'name', 'log_level', 'respawn')
 """Arguments that are no parameters of the node."""
 
@@ -63,7 +65,9 @@ def description(executables: list[str], arguments: Mapping[str, tuple[str, str]]
         ]
 
     declared = [
-        DeclareLaunchArgument(name, default_value=default, description=text)
+        DeclareLaunchArgument(
+            name, default_value=default, description=text, choices=CHOICES.get(name)
+        )
         for name, (default, text) in arguments.items()
     ]
     return LaunchDescription([*declared, OpaqueFunction(function=start)])

@@ -176,9 +176,10 @@ def test_a_number_that_can_not_be_is_refused_and_changes_nothing(name, number):
 
 def test_snapshot_of_other_entries_or_sizes_is_refused():
     labels, vector = pack(Flag(0), OnlineEstimator().state_dict())
-    for entries, names in ([np.zeros(8), labels], [vector, [*labels[:-1], labels[0]]]):
-        with pytest.raises(ConfigurationError, match=r'entries|arrays'):
-            unpack(entries, names)
+    with pytest.raises(ConfigurationError, match='whole arrays'):
+        unpack(np.zeros(8), labels)
+    with pytest.raises(ConfigurationError, match='entries'):
+        unpack(vector, [*labels[:-1], labels[0]])
     for names in ([], ['flags'], ['version'], ['y', 'z']):
         with pytest.raises(ConfigurationError, match='version'):
             unpack(np.full(len(names), 8.0), names)

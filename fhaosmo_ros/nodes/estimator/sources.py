@@ -83,8 +83,10 @@ class Source:
 
     def open(self) -> bool:
         """Look for fields in the type, if it is known; return whether there is a subscription."""
-        found = self._node.get_publishers_info_by_topic(self.topic)
-        message_type = self.message_type or min((end.topic_type for end in found), default='')
+        message_type = self.message_type
+        if not message_type:
+            found = self._node.get_publishers_info_by_topic(self.topic)
+            message_type = min((end.topic_type for end in found), default='')
         try:
             if message_type:
                 self._take_type(message_type)
