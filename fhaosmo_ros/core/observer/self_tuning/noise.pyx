@@ -192,18 +192,25 @@ cdef void follow_differences(Members* m, double y, double h) noexcept nogil:
     )
 
 
-cdef void follow_stamps(Members* m, double change) noexcept nogil:
+cdef double periods(Members* m, double interval) noexcept nogil:
+    """Return how many periods an interval is, at least one: samples in between were lost."""
+    return fmax(round(interval / m.shared.usual_interval), 1.0)
+
+
+cdef void follow_stamps(Members* m, double interval, double change) noexcept nogil:
     """
     Follow what changes of the interval say that the variance of the stamps is at most (D 29).
 
-    In the sample, `irregular` is the square of what its own stamp may be off by, and `roughness`
-    counts it, too: a single late stamp is seen there at once.
+    Whole periods of lost samples do not count. In the sample, `irregular` is the square of what
+    its own stamp may be off by, and `roughness` counts it, too: a single late stamp is seen there
+    at once.
     """
     cdef Shared* shared = &m.shared
     cdef Sample* sample = &m.work.sample
     cdef double least = EXACT * shared.steady_period, r
     sample.irregular = change * change
-    r = sample.irregular / (6.0 * shared.jitter)  # three stamps, one of them twice: 1 + 4 + 1
+    change -= (periods(m, interval) - periods(m, interval - change)) * shared.usual_interval
+    r = change * change / (6.0 * shared.jitter)  # three stamps, one of them twice: 1 + 4 + 1
     sample.roughness = fmax(sample.roughness, r)
     shared.jitter *= 1.0 + (fmin(r, HUBER * HUBER) / CLIPPED - 1.0) / ROUGH_SAMPLES
     shared.jitter = fmax(shared.jitter, least * least)

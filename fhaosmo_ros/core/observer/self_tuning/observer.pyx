@@ -18,7 +18,7 @@ from fhaosmo_ros.core.observer.self_tuning.members cimport (
 )
 from fhaosmo_ros.core.observer.self_tuning.noise cimport (
     APART, FADED, ROUNDED, STEADY, bound_of_noise, fill_noise, find_knowing, follow_differences,
-    follow_noise, follow_quantum, follow_stamps, is_even, is_likely, rounding
+    follow_noise, follow_quantum, follow_stamps, is_even, is_likely, periods, rounding
 )
 from fhaosmo_ros.core.observer.self_tuning.start cimport gather
 from fhaosmo_ros.core.observer.self_tuning.weights cimport (
@@ -231,7 +231,7 @@ cdef class SelfTuning(Structure):
             weigh(m)
         change = self.follow_interval(h - memory.behind)
         follow_differences(m, y, memory.interval)
-        follow_stamps(m, change)
+        follow_stamps(m, memory.interval, change)
         even, rough = is_even(m), sample.roughness > HUBER * HUBER
         sample.average = fmin(shared.samples, NOISE_SAMPLES)
         speed = self.look(y, h, u)
@@ -247,7 +247,7 @@ cdef class SelfTuning(Structure):
         likely = is_likely(m, gate, late) or (even and self.is_stamped_late(y, h, u, gate))
         if likely and memory.beyond == 0.0:
             shared.usual_interval += (
-                fmin(self.passed, 2.0 * shared.usual_interval) - shared.usual_interval
+                self.passed / periods(m, self.passed) - shared.usual_interval
             ) / sample.average
         begins = has_jumped(m, memory.beyond)
         expected = w.believed[shared.likeliest] * w.noise[shared.likeliest]
