@@ -130,7 +130,7 @@ cdef double least_rough(Members* m, int clock, int colour) noexcept nogil:
 
 cdef bint is_even(Members* m) noexcept nogil:
     """Return True if y moves as if its samples were evenly spaced, rather than at their stamps."""
-    return least_rough(m, 0, 0) < least_rough(m, 1, 0)
+    return least_rough(m, 0, 0) < STEADY * least_rough(m, 1, 0)
 
 
 cdef double usual_speed(Members* m) noexcept nogil:
