@@ -30,6 +30,7 @@ cdef class SelfTuning(Structure):
     cdef bint is_stamped_late(
         self, double y, double h, const double* u, double gate
     ) noexcept nogil
+    cdef double likelihood(self) noexcept nogil
     cdef void follow_period(self, double h, bint same) noexcept nogil
     cdef void carry_flow(self, double h, const double* u, bint same) noexcept nogil
     cdef void pass_over(self) noexcept nogil

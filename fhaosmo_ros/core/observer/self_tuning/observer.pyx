@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The self-tuning observer: members side by side, weighted by how well they predict y (D 26)."""
 
-from libc.math cimport INFINITY, NAN, copysign, exp, fabs, fmax, fmin, pow, sqrt
+from libc.math cimport INFINITY, NAN, copysign, exp, fabs, fmax, fmin, log, pow, sqrt
 from libc.stdlib cimport calloc, free
 from libc.string cimport memcpy, memset
 
@@ -244,7 +244,9 @@ cdef class SelfTuning(Structure):
             and not rough and shared.roughness < HUBER
         )
         gate = HUBER if goes_on else GATE
-        likely = is_likely(m, gate, late) or (even and self.is_stamped_late(y, h, u, gate))
+        likely = is_likely(m, gate, late)
+        if even and (not likely or sample.irregular > 6.0 * HUBER * HUBER * shared.jitter):
+            likely = self.is_stamped_late(y, h, u, gate) or likely
         if likely and memory.beyond == 0.0:
             shared.usual_interval += (
                 self.passed / periods(m, self.passed) - shared.usual_interval
@@ -323,7 +325,7 @@ cdef class SelfTuning(Structure):
         self, double y, double h, const double* u, double gate
     ) noexcept nogil:
         """
-        Return True if an evenly spaced sample is likely at another time than its stamp says.
+        Return True if an evenly spaced sample is likelier at another time than its stamp says.
 
         Samples wait for a busy host, which stamps them as it reads them. So the time since the
         last sample that was used may be the usual one; or, if that sample was late, the one of the
@@ -331,15 +333,23 @@ cdef class SelfTuning(Structure):
         """
         cdef Memory* memory = &self.memory
         cdef double usual = (memory.beyond + 1.0) * self.members.shared.usual_interval
-        cdef double passed = h - memory.behind
+        cdef double passed = h - memory.behind, likelihood
         if memory.behind == 0.0 or not 0.5 * usual < passed < 2.0 * usual:
             passed = usual
+        likelihood = self.likelihood()
         self.look(y, passed, u)
-        if is_likely(self.members, gate, 0.0):
+        if is_likely(self.members, gate, 0.0) and self.likelihood() > likelihood:
             self.passed = passed
             return True
         self.look(y, h, u)
         return False
+
+    cdef double likelihood(self) noexcept nogil:
+        """Return twice the log-likelihood of the sample, for the likeliest member."""
+        cdef Work* w = &self.members.work
+        cdef int g = self.members.shared.likeliest
+        cdef double variance = w.s[g] * w.noise[g]
+        return -w.b[g] * w.b[g] / variance - log(variance)
 
     cdef void follow_period(self, double h, bint same) noexcept nogil:
         """Decide which covariances move, and what depends on the period (D 27)."""
