@@ -223,7 +223,7 @@ cdef class SelfTuning(Structure):
         cdef Sample* sample = &w.sample
         cdef Memory* memory = &self.memory
         cdef double mean[MOST_STATES]
-        cdef double expected, since = 0.0, speed, change, late, gate
+        cdef double expected, since = 0.0, speed, change, late, gate, off
         cdef bint goes_on, likely, begins, jumped, rough, even
         cdef int i, since_jump = 0
         sample.quanta = rounding(m)
@@ -245,9 +245,12 @@ cdef class SelfTuning(Structure):
         )
         gate = HUBER if goes_on else GATE
         likely = is_likely(m, gate, late)
-        if even and (not likely or sample.irregular > 6.0 * HUBER * HUBER * shared.jitter):
+        off = fabs(memory.interval - shared.usual_interval)
+        if even and (not likely or off > fmax(
+            0.5 * shared.usual_interval, HUBER * sqrt(2.0 * shared.jitter)
+        )):
             likely = self.is_stamped_late(y, h, u, gate) or likely
-        if likely and memory.beyond == 0.0:
+        if likely and memory.beyond == 0.0 and self.passed > 0.5 * shared.usual_interval:
             shared.usual_interval += (
                 self.passed / periods(m, self.passed) - shared.usual_interval
             ) / sample.average

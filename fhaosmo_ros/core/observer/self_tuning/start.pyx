@@ -112,6 +112,8 @@ cdef double find_noise(Members* m, double least, double largest) noexcept nogil:
         values[1][i - 1] = m.first_h[i]
     shared.steady_period = period
     shared.usual_interval = median(values[1], FIRST_SAMPLES - 1)
+    if values[1][FIRST_SAMPLES // 4] < 0.5 * period:  # samples come in bursts
+        shared.usual_interval = period
     shared.jitter = fmax(size * size / 6.0, (EXACT * period) * (EXACT * period))
     ages[0][0] = ages[1][0] = 0.0
     for i in range(1, FIRST_SAMPLES):
