@@ -135,8 +135,8 @@ class SequenceNumbers:
     """
     Counts as `lost` the messages that did not arrive, by the numbers that a publisher gives them.
 
-    A number that is not above the one before is another publisher's: then there is no `single` one
-    any more, and nothing can be counted.
+    A number that is not above the one before is another publisher's: there is no `single` one any
+    more, and nothing is counted until there is one again.
     """
 
     def __init__(self) -> None:
@@ -147,9 +147,9 @@ class SequenceNumbers:
         number = info['publication_sequence_number'] or 0  # 0: the middleware has none
         if 0 < number <= self._before:
             self.single = False
-        elif number and self._before and self.single:
+        elif number and self._before:
             self.lost += number - self._before - 1
-        self._before = number
+        self._before = number if self.single else 0
 
 
 def set_period(timer: Timer, seconds: float) -> None:
