@@ -48,7 +48,7 @@ class Channel:
         self.estimator = OnlineEstimator(values)
         self.measured = measured_output(values, name)
         self.known = known_inputs(values, self.estimator.observer.used_inputs, name)
-        self._clock, self._active = node.get_clock(), False
+        self.clock, self._active = node.get_clock(), False
 
     def open(self) -> None:
         """Make its topics, and listen to y and to the known inputs."""
@@ -68,7 +68,6 @@ class Channel:
         for u, its in self.known.items():
             self.u[u] = node.sources.add(its, partial(self._on_input, inputs.index(u)))
         self.y = node.sources.add(self.measured, self._on_sample)  # after u
-        self.simulated = node.get_parameter('use_sim_time').value
         self.health = Health(self)
 
     def activate(self) -> None:
@@ -81,7 +80,7 @@ class Channel:
         self.health.begin()
         self._active = True
         if self.estimator.events.on:
-            self._say(self._clock.now().nanoseconds, 'no event yet')
+            self._say(self.clock.now().nanoseconds, 'no event yet')
         observer = self.estimator.observer
         self.logger.info(
             f'estimating {observer.order} states and the unknown input from '
@@ -109,7 +108,7 @@ class Channel:
         if not self._active:
             return
         by_clock = self.values['sampling'] == 'clock'
-        time = self._clock.now().nanoseconds if by_clock else stamp
+        time = self.clock.now().nanoseconds if by_clock else stamp
         if self.pairing.by_stamp:
             self.pairing.take_sample(stamp, (time, y))
             self._waits_since = perf_counter()
@@ -159,7 +158,7 @@ class Channel:
             self._arrived = self.stale = False
             self._silent_since = None
         elif not self.stale:
-            now = self._clock.now().nanoseconds
+            now = self.clock.now().nanoseconds
             if self._silent_since is None:  # the clock is not read while samples come
                 self._silent_since = now
             elif not 0 <= now - self._silent_since <= self.estimator.silence * 1e9:

@@ -109,6 +109,7 @@ class Health:
         """Report on the samples; `news` is by how much each counter has grown."""
         channel, y, limits = self._channel, self._channel.y, self._channel.values
         source, heard, names = y.source, y.source.heard, ', '.join(sorted(y.source.heard))
+        simulated = channel.clock.ros_time_is_active
         rate = 1.0 / period if period > 0.0 else nan
         delay = source.delay * NANOSECONDS if source.delay > -inf else nan
         offset = source.offset * NANOSECONDS if y.stamps == 'header' else 0.0
@@ -152,9 +153,9 @@ class Health:
         report.find(WARN, f'samples arrive {delay:.3g} s after their stamps', delay > latest)
         side = 'before' if offset > 0.0 else 'after'
         apart = f'header stamps lie {abs(offset):.3g} s {side} publication'
-        report.find(WARN, apart, not channel.simulated and abs(offset) > latest)
+        report.find(WARN, apart, not simulated and abs(offset) > latest)
         of_host = limits['sampling'] == 'source_stamp' and y.stamps == 'source'
-        report.find(WARN, HOST_TIME, channel.simulated and of_host)
+        report.find(WARN, HOST_TIME, simulated and of_host)
         for name, u in channel.u.items():
             report.find(ERROR, u.error, u.error)
             for text in u.source.unheard:
