@@ -138,7 +138,7 @@ class EstimatorNode(ManagedNode):
         if present[CHANNELS] != FROM_JOINTS:
             self.sources.of(measured_output(present)).on_names = None
             new = [name for name in names if name not in self._joints]
-            self._left_out.append(left_out(new, 'not in the first message'))
+            self._left_out.append(left_out(new, 'not in the first message; list all in channels'))
             return
         most = present['max_channels']
         fit, bad = [], []
@@ -213,7 +213,7 @@ class EstimatorNode(ManagedNode):
 
     def _prepare(self, values: Parameters, changes: Mapping[str, Value]) -> None:
         """Raise for changes that can not be, with the name of the channel."""
-        if not self._channels:  # whether the values fit together is checked by configure
+        if self._parameters_topic is None:  # configure checks whether the values fit together
             return
         present = self.values
         for name, value in changes.items():
@@ -243,7 +243,9 @@ class EstimatorNode(ManagedNode):
             clock = self.resolve_topic_name('/clock')
             state.find(ERROR, f'use_sim_time, but nothing on {clock} yet')
         waits = active and not self._channels
-        state.find(STALE, 'no message with the names of the joints yet', waits)
+        failed = waits and self._joints
+        state.find(ERROR, 'no channels of the joints could be made: see the log', failed)
+        state.find(STALE, 'no message with the names of the joints yet', waits and not failed)
         for text in self._left_out:
             state.find(WARN, text, text)
         reports = [state]
