@@ -213,9 +213,9 @@ INPUT = (
               'The numbers in their messages, as input_field; also of the message of y.',
               live=False, lengths='1 (for all) or one each'),
     Parameter('known_input_stamps', ['reception'],
-              'reception: an input holds from its arrival; one of the message of y is that of '
-              'its sample. header: a sample gets the newest one whose header stamp is not after '
-              'its own; y is then read with that of its header, too.',
+              'reception: a sample gets the newest one that has arrived; one of the message of y '
+              'is that of its sample. header: the newest one whose header stamp is not after its '
+              'own; y is then read with that of its header, too.',
               choices=('reception', 'header'), live=False, lengths='1 (for all) or one each'),
     Parameter('known_input_wait', 0.0,
               'How long, by the stamps of y, a sample waits until each input with '
