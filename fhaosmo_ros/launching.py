@@ -10,13 +10,13 @@ ESTIMATOR = {
     'name': ('estimator', 'name of the node'),
     'input_topic': ('', 'topic of y; empty: as the file says, else y'),
     'input_field': ('', 'number in its messages; empty: as the file says, else the only one'),
-    'autostart': ('true', 'false: a lifecycle manager configures and activates the node'),
+    'autostart': ('', 'false: a lifecycle manager activates the node; empty: as the file says'),
     'respawn': ('false', 'start the node again, after 2 s, if it ends'),
 }
 """Arguments of an estimator: default and description by name."""
 COMMON = {
     'namespace': ('', 'namespace of what is started'),
-    'use_sim_time': ('false', 'take the time from /clock'),
+    'use_sim_time': ('', 'true: take the time from /clock; empty: as the file says'),
     'log_level': ('info', 'least severity that is logged'),
 }
 CHOICES = {'log_level': ['debug', 'info', 'warn', 'error', 'fatal']}
@@ -53,7 +53,7 @@ def description(executables: list[str], arguments: Mapping[str, tuple[str, str]]
                 executable=executable,
                 name=given.get('name', executable),
                 namespace=given['namespace'],
-                parameters=[*([path] if path else []), values],
+                parameters=[source for source in (path, values) if source],
                 ros_arguments=['--log-level', given['log_level']],
                 output='screen',
                 emulate_tty=True,

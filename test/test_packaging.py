@@ -144,10 +144,10 @@ def test_launch_files_start_their_nodes_with_files_that_are_there(started, tmp_p
     for name, file in ('arm', 'arm'), ('joint_estimator', 'joint_states'):
         (node,) = started(name)
         assert (node['name'], node['on_exit']) == (name, None)
-        assert node['parameters'][0] == str(ROOT / f'config/{file}.yaml')
+        assert node['parameters'] == [str(ROOT / f'config/{file}.yaml')]
     own = {'input_topic': '/joint_states', 'input_field': 'position[elbow]'}
     (node,) = started('estimator', params_file=__file__, autostart='false', respawn='true', **own)
-    assert node['parameters'] == [__file__, {'use_sim_time': False, 'autostart': False} | own]
+    assert node['parameters'] == [__file__, {'autostart': False} | own]
     assert node['respawn'] is True
     with pytest.raises(FileNotFoundError, match=f'params_file: .* got {tmp_path}'):
         started('estimator', params_file=str(tmp_path))
