@@ -96,9 +96,9 @@ class Pairing:
 
     `values` are the parameters of the channel, `names` all known inputs of the model, `known`
     those that it uses, `held` what they are before the first ones come. `by_stamp` is False where
-    none has to be paired. `late` inputs came after their sample had been released; `ahead` samples
-    were released when all of an input's stamps were later than theirs, or the next one by more
-    than max_gap.
+    none has to be paired. `late` inputs came after their sample had been released; `lacking`
+    samples waited for one in vain; `ahead` samples were released when all of an input's stamps
+    were later than theirs, or the next one by more than max_gap.
     """
 
     def __init__(
@@ -117,7 +117,7 @@ class Pairing:
         self._newest = dict.fromkeys(paired, 0)
         self._known: set[int] = set()
         self._waiting: deque[tuple[int, Any, list[float]]] = deque()
-        self._done = self.late = self.ahead = 0
+        self._done = self.late = self.lacking = self.ahead = 0
 
     def forget_samples(self) -> None:
         """Drop the samples that wait; inputs stay."""
@@ -147,13 +147,15 @@ class Pairing:
         """Yield the samples that need not wait any more, and their inputs; `at_once`: all."""
         while self._waiting:
             stamp, sample, u = self._waiting[0]
+            complete = all(newest >= stamp for newest in self._newest.values())
             if not (
-                at_once
+                complete
+                or at_once
                 or abs(self._waiting[-1][0] - stamp) >= self._wait
                 or len(self._waiting) > MOST
-                or all(newest >= stamp for newest in self._newest.values())
             ):
                 return
+            self.lacking += self._wait > 0 and not complete
             self._waiting.popleft()
             for j, coming in self._coming.items():
                 while coming and coming[0][0] <= stamp:

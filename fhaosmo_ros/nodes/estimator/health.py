@@ -30,7 +30,7 @@ UNUSED = {
     'deviations, from its prediction',
     'rejected stuck': '{n} samples rejected: y repeats itself, for longer than stuck_time or '
     'although it has noise: its sensor is stuck',
-    'rejected steps': '{n} samples rejected: y would have made the estimate infinite',
+    'rejected steps': '{n} samples rejected: the estimate would have become infinite',
     'duplicate stamps': '{n} samples rejected: their stamps were those of the ones before',
     'backward stamps': '{n} samples rejected: their stamps were older than those before',
     'zero stamps': '{n} samples rejected: {zero}',
@@ -44,6 +44,8 @@ UNUSUAL = {
     'slowly, set max_gap to several of its periods',
     'late inputs': '{n} late inputs, which came after their sample had been used: raise '
     'known_input_wait, or their header stamps are of another clock',
+    'samples without their input': '{n} samples waited for a known input in vain: it stopped, or '
+    'its header stamps are 0, or of another clock',
     'samples before any input': '{n} samples before any input, whose stamps are all later: are '
     'the header stamps of one clock?',
 }
@@ -89,6 +91,7 @@ class Health:
             **own,
             'restarts': counters.restarts,
             'late inputs': channel.pairing.late,
+            'samples without their input': channel.pairing.lacking,
             'samples before any input': channel.pairing.ahead,
             'events': channel.estimator.events.count,
         }
