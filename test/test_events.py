@@ -143,7 +143,7 @@ def test_a_reset_ends_an_event_and_so_does_switching_off(samples):
     estimator.configure({'event_threshold': 0.0})
     assert not estimator.events.active
     estimator.run(stamps[1400:], y[1400:])
-    assert [e.begins for e in estimator.events.taken()] == [True]
+    assert [e.begins for e in estimator.events.taken()] == [True, False]
 
 
 def test_standard_deviations_that_nobody_knows_are_refused():

@@ -130,7 +130,12 @@ class EventDetector:
         self._release = p['event_release']
         self.on = self._threshold > 0.0 or self._deviations > 0.0
         if was_on and not self.on:
-            self.memory.event = FRESH
+            m = self.memory
+            if self.active:
+                end = m.event_stamp + m.event_time - m.event_since
+                nan = math.nan
+                self.waiting.append(Event(end, False, m.event_stamp, nan, math.inf, nan))
+            m.event = FRESH
 
     def reset(self) -> None:
         """Expect estimates of a fresh observer: what was known of the mean does not count."""
