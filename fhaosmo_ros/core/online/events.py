@@ -133,8 +133,7 @@ class EventDetector:
             m = self.memory
             if self.active:
                 end = m.event_stamp + m.event_time - m.event_since
-                nan = math.nan
-                self.waiting.append(Event(end, False, m.event_stamp, nan, math.inf, nan))
+                self.waiting.append(Event(end, False, m.event_stamp, math.nan, math.inf, math.nan))
             m.event = FRESH
 
     def reset(self) -> None:
