@@ -93,9 +93,9 @@ def test_output_replaces_only_what_is_empty_or_forced_and_only_when_it_is_comple
     with pytest.raises(OSError, match=str(final)), output_at(final, force=True):
         raise OSError(ENOSPC, 'No space left on device')
     assert [p.name for p in tmp_path.iterdir()] == ['out']
-    in_use = pytest.raises(ConfigurationError, match='a folder that is in use')
-    with in_use, output_at(Path('..'), force=True):
-        pass
+    for place, inputs, why in (Path('..'), [], 'in use'), (tmp_path, [final], 'the input'):
+        with pytest.raises(ConfigurationError, match=why), output_at(place, True, *inputs):
+            pass
 
 
 SLOW = """

@@ -90,7 +90,7 @@ def _calibrate(arguments: argparse.Namespace, stop: Stop) -> None:
     print('In parts of the recording that were held out:')
     print(_table(arm.joints, 'URDF', 'calibrated', found.before, found.after))
     print(*found.notes, sep='\n')
-    with output_at(arguments.output, arguments.force) as path:
+    with output_at(arguments.output, arguments.force, arguments.bag) as path:
         text = replace(found.calibration, log_odds=level).dumps()
         path.write_text(text, encoding='utf-8')
     print(f'calibration: {arguments.output}')

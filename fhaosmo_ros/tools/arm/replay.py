@@ -89,7 +89,7 @@ def _replay(arguments: argparse.Namespace, stop: Stop) -> None:
     with stop.raising(), BagReader(arguments.bag) as reader:
         arm = Arm(description(reader, arguments), arm_parameters(arguments))
         with (
-            output_at(arguments.output, arguments.force) as path,
+            output_at(arguments.output, arguments.force, arguments.bag) as path,
             path.open('w', newline='', encoding='utf-8') as file,
         ):
             table, deviations = csv.writer(file), [f'{name}_deviation' for name in arm.joints]

@@ -97,17 +97,22 @@ def values_of(rules: Sequence[str]) -> dict[str, Any]:
 
 
 @contextmanager
-def output_at(final: Path, force: bool = False) -> Iterator[Path]:
+def output_at(final: Path, force: bool = False, *inputs: Path) -> Iterator[Path]:
     """
     Yield where to write a file or folder meanwhile, and move it to its place once complete.
 
     It is complete when the block ends without an error; else nothing stays, and what was there
     before does. The path that is yielded has the final name, in a hidden folder beside its place,
     and does not exist yet. ConfigurationError if the place is in use, unless `force`: by a file,
-    or a folder that is not empty.
+    or a folder that is not empty; `force` or not, by one of the inputs.
     """
     if final.name in ('', '..'):  # nothing could be renamed to it
         raise ConfigurationError(f'output {final}: expected a name, got a folder that is in use')
+    for path in map(Path.resolve, inputs):
+        if final.resolve() in (path, *path.parents):
+            raise ConfigurationError(
+                f'output {final}: expected another place than the input has, got that of {path}'
+            )
     empty = not final.exists() or (final.is_dir() and not any(final.iterdir()))
     if not (empty or force):
         raise ConfigurationError(

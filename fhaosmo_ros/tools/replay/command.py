@@ -162,7 +162,10 @@ def _replay(arguments: argparse.Namespace, stop: Stop) -> None:
         namespace, model = node.rpartition('/')[0], estimator.observer.model
         inputs = BagInputs(reader, values, model, namespace, arguments.channel)
         finals = arguments.output or [Path(f'{bag_name}_replayed')]
-        outputs = [stack.enter_context(output_at(path, arguments.force)) for path in finals]
+        outputs = [
+            stack.enter_context(output_at(final, arguments.force, arguments.bag))
+            for final in finals
+        ]
         name = _name({c.topic for c in reader.connections}, arguments.name)
         with stop.raising(), ExitStack() as files:
             samples, field = inputs.samples()

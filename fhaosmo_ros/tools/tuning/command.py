@@ -75,7 +75,8 @@ def _tune(arguments: argparse.Namespace, stop: Stop) -> None:
             f'{arguments.trials}, {arguments.jobs} and {arguments.seed}'
         )
     estimator, tuning = read_parameters(arguments.params_file, arguments.param)
-    with output_at(arguments.output, arguments.force) as folder:
+    inputs = [arguments.bag] if arguments.bag else []
+    with output_at(arguments.output, arguments.force, *inputs) as folder:
         if arguments.bag:
             with stop.raising():
                 parameters, text = _of_bag(arguments.bag, estimator, tuning)
