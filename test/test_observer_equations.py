@@ -294,10 +294,10 @@ def test_options_of_the_cascade_follow_the_equations(scheme, options):
 
 
 @pytest.mark.parametrize('derivatives', [0, 2])
-@pytest.mark.parametrize('decay', [0.0, 5.0])
+@pytest.mark.parametrize(('decay', 'off'), [(0.0, 1e-7), (5.0, 1e-7), (2e3, 2e-3)])
 @pytest.mark.parametrize('n', [1, 2])
 @pytest.mark.parametrize('variant', VARIANTS)
-def test_levant_follows_the_equations(variant, n, decay, derivatives):
+def test_levant_follows_the_equations(variant, n, decay, off, derivatives):
     levels = n + 1 + derivatives
     p = parameters(n, True, variant=variant, unknown_input_decay=decay) | {
         'structure': 'levant', 'unknown_input_derivatives': derivatives, 'gamma_initial': 0.7,
@@ -311,8 +311,8 @@ def test_levant_follows_the_equations(variant, n, decay, derivatives):
     for k in range(1, len(t)):
         reference.step(y[k], t[k] - t[k - 1], u[k])
         z.append(reference.z)
-    np.testing.assert_allclose(result.z_hat, z, rtol=1e-7, atol=1e-7)
-    assert np.ptp(result.z_hat, axis=0).min() > 0.1  # every level moved
+    np.testing.assert_allclose(result.z_hat, z, rtol=off, atol=off)
+    assert np.ptp(result.z_hat, axis=0).min() > 0.04  # every level moved
     np.testing.assert_array_equal(result.z_tilde[1:, :-1], result.z_hat[1:, 1:])
     np.testing.assert_array_equal(result.z, result.z_hat[:, :n])
     np.testing.assert_array_equal(result.unknown_input, result.z_hat[:, n])

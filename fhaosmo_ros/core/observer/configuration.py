@@ -72,7 +72,8 @@ class ObserverConfiguration:
         self.schedule = None
         self.steady, n = np.zeros((0, 0)), self.model.order
         self.state_sizes = per_level(OBSERVER_PARAMETERS['state_sizes'], p['state_sizes'], n)
-        self.prediction_step = p['prediction_step'] or usual_step(self.model)
+        decay = 0.0 if self.self_tuning else p['unknown_input_decay']
+        self.prediction_step = p['prediction_step'] or usual_step(self.model, decay)
         self._check_structure()
         if self.self_tuning:
             self._complete_self_tuning()
@@ -197,10 +198,15 @@ def deadbeat_shares(count: int) -> Floats:
     return result
 
 
-def usual_step(model: TriangularModel) -> float:
-    """Return the Runge-Kutta step (s) that follows the fastest motion of a model at rest."""
+def usual_step(model: TriangularModel, decay: float = 0.0) -> float:
+    """
+    Return the Runge-Kutta step (s) that follows the fastest motion of a model at rest.
+
+    Of a d that decays it has to be stable only: how d moves is a guess.
+    """
     fastest = LinearModel(model.slopes_at_rest + np.eye(model.order, k=1), 0.0).fastest
-    return float(STEP / fastest) if fastest > 0.0 else math.inf
+    rate = max(fastest / STEP, decay)
+    return float(1.0 / rate) if rate > 0.0 else math.inf
 
 
 def per_level(parameter: Parameter, values: list[float], count: int) -> Floats:

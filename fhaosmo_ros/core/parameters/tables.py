@@ -39,7 +39,7 @@ OBSERVER = (
     Parameter('unknown_input_decay', 0.0,
               "Rate kappa of the model d' = -kappa d + what the innovations say. Greater where "
               'd varies around 0: less noise in the estimate, which is too small where d stays. '
-              'Explicit: below 2 / dt.', unit='1/s', lower=0.0, upper=1e3),
+              'Explicit: below 2 / dt.', unit='1/s', lower=0.0, upper=1e6),
     Parameter('gains', 'fixed',
               'fixed: those below; their defaults are for the default phi. self_tuning: noise, '
               'size and speed of d are found and followed (docs/self_tuning.md). Of the '
