@@ -18,7 +18,7 @@ def known_inputs(u: ArrayLike, names: Sequence[str], count: int | None = None) -
     `u` is of that shape, or (count,) of the only input; a number is the only input's, always, or 0
     for any of them. Raises ConfigurationError for another shape.
     """
-    values, single = np.asarray(u, dtype=np.float64), len(names) == 1
+    values, single = _doubles(u), len(names) == 1
     shape = (len(names),) if count is None else (count, len(names))
     if single and values.shape == (count,):
         values = values[:, np.newaxis]
@@ -35,11 +35,14 @@ def samples_of_run(t: ArrayLike, y: ArrayLike) -> tuple[NDArray[Any], Floats]:
     """
     Return times and samples as contiguous arrays (K,) of 64-bit numbers; integers stay integers.
 
-    Columns of a table, (K, 1), are taken as well. Raises ConfigurationError for more dimensions,
-    or different lengths.
+    Dates and durations (datetime64, timedelta64) become nanoseconds. Columns of a table, (K, 1),
+    are taken as well. Raises ConfigurationError for more dimensions, or different lengths.
     """
     columns: list[NDArray[Any]] = []
-    for values in (np.asarray(t), np.asarray(y, dtype=np.float64)):
+    t = np.asarray(t)
+    if t.dtype.kind in 'mM':
+        t = t.astype(f'{t.dtype.kind}8[ns]').astype(np.int64)
+    for values in (t, _doubles(y)):
         column = values[:, 0] if values.ndim == 2 and values.shape[1] == 1 else values
         kind = np.int64 if np.issubdtype(column.dtype, np.integer) else np.float64
         columns.append(np.ascontiguousarray(column, dtype=kind))
@@ -50,3 +53,10 @@ def samples_of_run(t: ArrayLike, y: ArrayLike) -> tuple[NDArray[Any], Floats]:
             f'{t.shape} and {y.shape}'
         )
     return t, y
+
+
+def _doubles(values: Any) -> Floats:
+    """Return values as an array of doubles, NaN where an array has masked them."""
+    if hasattr(values, 'filled'):
+        values = values.astype(np.float64).filled(np.nan)
+    return np.asarray(values, dtype=np.float64)

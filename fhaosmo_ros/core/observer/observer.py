@@ -255,10 +255,10 @@ class Observer:
         Parameters
         ----------
         t : (K,) array
-            Sample times, in seconds, or in nanoseconds if integers; they increase. Columns of a
-            table, (K, 1), are taken as well, of this and the others.
+            Sample times, in seconds, or in nanoseconds if integers, or datetime64; they increase.
+            Columns of a table, (K, 1), are taken as well, of this and the others.
         y : (K,) array
-            Samples; NaN stands for a missing one.
+            Samples; NaN, or a mask, stands for a missing one.
         u : number, (K,) or (K, m) array, optional
             Known input, or known inputs, during the interval that ends at each sample; needed
             where phi uses one.

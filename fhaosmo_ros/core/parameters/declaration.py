@@ -165,6 +165,11 @@ class ParameterTable(Mapping[str, Parameter]):
         ``{'constants': {'k': 3}}`` is the same as ``{'constants.k': 3}``. Raises
         ConfigurationError for an unknown name (with the closest known one), or a bad value.
         """
+        if not isinstance(values, Mapping):
+            raise ConfigurationError(
+                'parameters: expected a mapping of names to values (`from_yaml` reads a file), '
+                f'got {shown(values)}'
+            )
         flat: dict[str, Any] = {}
         for name, value in values.items():
             if f'{name}{ANY_NAME}' in self._by_name and isinstance(value, Mapping):
