@@ -5,7 +5,6 @@ import bag_files as files
 from fhaosmo_ros.core import ConfigurationError, EventDetector, OnlineEstimator
 from fhaosmo_ros.core.observer.estimates import TUNING
 from fhaosmo_ros.core.observer.status import Status
-from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
 from fhaosmo_ros.tools import plot
 from fhaosmo_ros.tools.bags.reader import BagReader
 from fhaosmo_ros.tools.plot import read_curves
@@ -16,12 +15,11 @@ import pytest
 
 H = 10**6
 BEGIN = 1_700_000_000 * 10**9
-DEFAULTS = ESTIMATOR_PARAMETERS.defaults()
 
 
 def found(d, deviations=None, words=None, **parameters):
     """Return the events in estimates of d at 1 kHz, as (sample, begins)."""
-    detector = EventDetector(DEFAULTS | parameters)
+    detector = EventDetector(parameters)
     stamps = BEGIN + H * np.arange(len(d))
     detector.take(stamps, d, deviations, words=words)
     events = detector.taken()

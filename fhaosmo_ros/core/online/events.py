@@ -26,6 +26,7 @@ import math
 from typing import Any, NamedTuple
 
 from fhaosmo_ros.core.observer.status import AFRESH, UNUSED
+from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -90,8 +91,9 @@ class EventDetector:
     Parameters
     ----------
     parameters : mapping
-        Those whose names begin with ``event_``, tuning_memory, and max_gap: after a longer time
-        durations begin anew (0: never). Others are left alone.
+        Values for those of an `OnlineEstimator`; defaults for the rest. Used are those whose names
+        begin with ``event_``, tuning_memory, and max_gap: after a longer time durations begin
+        anew (0: never).
 
     Attributes
     ----------
@@ -118,7 +120,7 @@ class EventDetector:
 
     def configure(self, parameters: Mapping[str, Any]) -> None:
         """Go on with other parameters; an event that lasts ends if none are asked for."""
-        p, was_on = parameters, self.on
+        p, was_on = ESTIMATOR_PARAMETERS.complete(parameters), self.on
         change_time = round(p['event_change_time'] * SECOND)
         if was_on and change_time != self._change_time:
             self.reset()
