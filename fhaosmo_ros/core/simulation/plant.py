@@ -140,7 +140,7 @@ class Plant:
         Raises
         ------
         ConfigurationError
-            A time that is not finite, or u of another shape.
+            A time that is not finite or before the last one, or u of another shape.
 
         """
         z = self._system.advance(t, known_inputs(u, self.model.inputs, np.size(t)))

@@ -144,8 +144,8 @@ cdef class System(Dynamics):
             raise ValueError(f'expected known inputs of shape ({count}, m), got {np.shape(u)}')
         if inputs.shape[1] == 0:
             inputs = np.zeros((count, 1))
-        if not np.isfinite(times).all():
-            raise ConfigurationError('plant: expected finite times, got some that are not')
+        if not (np.isfinite(times).all() and (np.diff(times) >= 0.0).all()):
+            raise ConfigurationError('plant: expected finite times that rise or stay, got others')
         for k in range(count):
             if on_grid:
                 self.go_to(times[k], &inputs[k, 0])
