@@ -69,7 +69,7 @@ def test_what_cannot_be_used_is_refused_in_one_line(urdf, named, text):
 
 
 def test_mimic_joints_and_grippers_are_left_out_and_joints_may_be_chosen():
-    finger = segment('finger', 'tool', 'jaw', '1 0 0', 0.0, 0.1, 0.1, 'prismatic')
+    finger = segment('finger', 'tool', 'finger', '1 0 0', 0.0, 0.1, 0.1, 'prismatic')
     second = segment('second', 'tool', 'other', '1 0 0', 0.0, 0.1, 0.1)
     second = second.replace('</joint>', '<mimic joint="finger"/></joint>')
     more = URDF.replace('</robot>', f'{finger}{second}</robot>')

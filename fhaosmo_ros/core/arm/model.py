@@ -76,12 +76,12 @@ class ArmModel:
                 'arms need Pinocchio, which is not installed: pip install pin (rosdep: pinocchio)'
             )
         try:
-            mimics = [j.get('name') for j in ElementTree.fromstring(urdf).iterfind('joint[mimic]')]
-            whole = pin.buildModelFromXML(urdf)
+            robot, whole = ElementTree.fromstring(urdf), pin.buildModelFromXML(urdf)
         except (ElementTree.ParseError, ValueError) as error:
             text = f'robot description: expected a URDF, got {urdf[:40]!r} ({error})'
             raise ConfigurationError(text) from None
         moving = dict(zip(list(whole.names)[1:], list(whole.joints)[1:], strict=True))
+        mimics = [joint.get('name') for joint in robot.iterfind('joint[mimic]')]
         chosen = list(joints) or [
             name for name in moving
             if name not in mimics and not any(word in name.lower() for word in GRIPPER)
@@ -91,15 +91,22 @@ class ArmModel:
                 f'joints: expected some of {", ".join(moving) or "none"}, got {", ".join(unknown)}'
             )
         if not chosen:
-            raise ConfigurationError('robot description: expected a joint that moves, got none')
+            raise ConfigurationError(
+                'robot description: expected a joint that moves and is no gripper, got '
+                f'{", ".join(moving) or "none"} (parameter joints)'
+            )
         for name, joint in moving.items():
             if joint.nv > 1:
                 raise ConfigurationError(
                     f'joint {name}: expected a fixed base and joints that turn or slide along '
                     f'one axis, got one that moves in {joint.nv} directions'
                 )
-        others = [whole.getJointId(name) for name in moving if name not in chosen]
-        self._model = model = pin.buildReducedModel(whole, others, pin.neutral(whole))
+        # Pinocchio's reduced model would refuse a link that has the name of a joint.
+        for joint in robot.iterfind('joint'):
+            if joint.get('name') not in chosen:
+                joint.set('type', 'fixed')
+        reduced = ElementTree.tostring(robot, encoding='unicode')
+        self._model = model = pin.buildModelFromXML(reduced)
         self._data, self._zero = model.createData(), pin.neutral(model)
         self.gravity = model.gravity.linear = np.array(gravity, dtype=np.float64)
         self.joints = tuple(model.names[1:])
@@ -193,11 +200,11 @@ class ArmModel:
 
     def frame_jacobian(self, q: Floats, frame: str) -> Floats:
         """Return the Jacobian (6, n) at a frame's origin; raise ConfigurationError without it."""
-        model = self._model
-        if not model.existFrame(frame):
-            known = [f.name for f in model.frames if f.type == pin.FrameType.BODY]
+        model, link = self._model, pin.FrameType.BODY
+        if not model.existFrame(frame, link):
+            known = [f.name for f in model.frames if f.type == link]
             raise ConfigurationError(f'frame: expected one of {", ".join(known)}, got {frame!r}')
-        at = *self._at(q), model.getFrameId(frame), pin.ReferenceFrame.LOCAL
+        at = *self._at(q), model.getFrameId(frame, link), pin.ReferenceFrame.LOCAL
         return np.asarray(pin.computeFrameJacobian(*at).reshape(6, -1))
 
     def regressor(self, q: Floats, velocity: Floats, acceleration: Floats) -> Floats:
