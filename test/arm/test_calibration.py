@@ -134,5 +134,5 @@ def test_commands_calibrate_check_and_replay_a_bag(tmp_path, capsys):
     assert (tmp_path / 'three.png').stat().st_size > 10_000
     assert replay.main([str(bag), '-o', str(table), *known]) == 0
     rows = np.genfromtxt(table, delimiter=',', skip_header=1, usecols=range(7))
-    assert np.abs(rows[500:, 1:4]).mean() < 0.5
+    assert np.abs(rows[500:, 1:4]).mean() < 0.012  # also where friction turns round
     assert Calibration.loads(file.read_text()).log_odds >= calibrate.LEAST

@@ -35,7 +35,7 @@ DAMPING = 0.02  # m, singular value of a frame's Jacobian below which a force al
 # known of the link still counts at the next one, since a contact may slide.
 LOOK, LOOK_CLOSELY, KEEP = 0.05, 0.01, 0.96
 ELSEWHERE = 0.02  # by so much forces on each link still count, however sure another link is
-SLIDING = 0.005  # s: memory of the differences of positions that friction is computed from
+SLIDING = 0.01  # s: memory of the differences of positions that friction is computed from
 ANEW = 'clock set back', 'restarts', 'jumped', 'diverged'
 """What makes the estimates begin anew."""
 
@@ -259,19 +259,23 @@ class Arm:
         bank, samples, before = self._bank, self._samples, self._velocity
         if before is None or not self._of_position:
             known = self._sliding = way / h if self._of_position else velocity
+            self._faster = self._rest
         else:
             known = before
             if self._calibrated:
-                news = way / h - self._sliding
-                self._sliding = self._sliding - np.expm1(-h / SLIDING) * news
+                # A line: by their mean friction would turn round too late, which is a contact.
+                keep, ahead = np.exp(-h / SLIDING), self._sliding + h * self._faster
+                news = way / h - ahead
+                self._sliding = ahead + (1.0 - keep**2) * news
+                self._faster = self._faster + (1.0 - keep) ** 2 / h * news
         mass, coriolis, gravity = self.model.terms(q, known)
         less = [self._tare]
         if self._with_gravity:
             less.append(gravity)
         if self._calibrated:
             # Of encoders alone, because the estimate M^-1 p would feed its own error of friction
-            # back, worst at joints of little inertia.
-            less.append(self.calibration.friction(self._sliding))
+            # back, worst at joints of little inertia. What they say is of half a sample ago.
+            less.append(self.calibration.friction(self._sliding + 0.5 * h * self._faster))
         drive = bank.net_torque(samples.torque, known, coriolis, less)
         if before is None:
             wide = samples.variance[1] / (h * h) if self._of_position else samples.variance[2]

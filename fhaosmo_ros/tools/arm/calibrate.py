@@ -43,7 +43,7 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _calibrate(arguments: argparse.Namespace, stop: Stop) -> None:
-    values = arm_parameters(arguments) | {'measurement': 'position'}
+    values = arm_parameters(arguments)
     if (arguments.payload or arguments.check) and not values.get('calibration_file'):
         raise ConfigurationError(
             '--payload, --check: expected -p calibration_file:=FILE of the arm without payload, '
@@ -59,7 +59,8 @@ def _calibrate(arguments: argparse.Namespace, stop: Stop) -> None:
         when, samples = np.array(stamps), np.array(rows)
         newest = np.maximum.accumulate(np.concatenate([[0], when[:-1]]))
         good = np.isfinite(samples).all(axis=(1, 2)) & (when > newest)
-        t, q, effort = (when[good] - when[good][:1]) * 1e-9, samples[good, 0], samples[good, 1]
+        t = (when[good] - when[good][:1]) * 1e-9
+        q, effort, *velocity = samples[good].swapaxes(0, 1)
         torque = effort
         if arm.parameters['effort'] == 'gravity_compensated':
             torque = effort + np.array([arm.model.terms(row, 0.0 * row).gravity for row in q])
@@ -83,7 +84,7 @@ def _calibrate(arguments: argparse.Namespace, stop: Stop) -> None:
         found = identification.identify(arm.model, t, q, torque, torque_constants=constants)
         # The log-odds of contact that this free motion reaches once a minute.
         free = Arm(urdf, values, calibration=found.calibration)
-        odds = np.nan_to_num(free.run(t, q, effort).log_odds, nan=-np.inf)
+        odds = np.nan_to_num(free.run(t, q, effort, *velocity).log_odds, nan=-np.inf)
         seconds = t.astype(int)
         peaks = np.sort([np.max(odds[seconds == s]) for s in np.unique(seconds)])[::-1]
         level = max(float(peaks[len(peaks) // 60]), LEAST)
