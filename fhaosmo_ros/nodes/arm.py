@@ -85,6 +85,7 @@ class ArmNode(BaseNode):
             self._use(text_of(values, 'robot_description_file', 'a URDF'))
         else:
             self._topic = self.resolve_topic_name('robot_description')
+            self._missing = f'no robot yet on {self._topic}'
             self.create_subscription(String, 'robot_description', self._on_description, LATCHED)
             self.get_logger().info(f'waiting for the robot on {self._topic}')
         self.create_subscription(JointState, values['input_topic'], self._on_sample, SENSOR_QOS)
@@ -112,7 +113,8 @@ class ArmNode(BaseNode):
             try:
                 self._use(message.data)
             except ConfigurationError as error:
-                self._warn(str(error))
+                self._missing = str(error)
+                self.get_logger().error(self._missing)
         elif message.data != self._description:
             self._warn(f'a second robot on {self._topic} is ignored: start the node again for it')
 
@@ -130,7 +132,12 @@ class ArmNode(BaseNode):
         estimate = arm.take(stamp, *arrays)
         if arm.problem in MEANT:
             anew = ': the estimates began anew' if arm.problem in ANEW else ''
-            self._warn(f'{MEANT[arm.problem]}{anew} ({arm.counters[arm.problem]} so far)')
+            got = ', '.join(
+                f'{what} {" ".join(f"{x:.3g}" for x in numbers)}'
+                for what, numbers in zip(('position', 'effort', 'velocity'), arrays, strict=False)
+            )
+            count = arm.counters[arm.problem]
+            self._warn(f'{MEANT[arm.problem]}{anew} ({count} so far; got {got})')
         if arm.doubts.text:
             self._warn(arm.doubts.text)
         if estimate is None:
@@ -194,7 +201,7 @@ class ArmNode(BaseNode):
             report.find(WARN, problem)
         self._problems.clear()
         if self._arm is None:
-            report.find(ERROR, f'no robot yet on {self._topic}')
+            report.find(ERROR, self._missing)
             return [report]
         silent = perf_counter() - self._latest
         if not silent < SILENT:
@@ -204,10 +211,10 @@ class ArmNode(BaseNode):
             if self._contact:
                 self._contact = None
                 self._tell(STALE, f'no usable sample {since}: contact is not known')
-        report.values |= {f'samples {what}': n for what, n in self._arm.counters.items()}
-        if self._estimate is not None:
+        elif self._estimate is not None:
             report.values['log odds of contact'] = self._estimate.log_odds
             report.values['contact'] = self._estimate.link or 'none'
+        report.values |= {f'samples {what}': n for what, n in self._arm.counters.items()}
         return [report]
 
     def _prepare(self, values: Parameters, _: Mapping[str, Value]) -> Parameters:

@@ -49,7 +49,6 @@ def test_a_payload_is_weight_at_its_place():
 
 
 @pytest.mark.parametrize(('urdf', 'named', 'text'), [
-    ('<sdf/>', {}, 'expected a URDF, got'),
     (URDF.replace('parent link="base"', 'parent link="bse"'), {}, 'expected a URDF, got'),
     ('<robot name="r"><link name="a"/></robot>', {}, 'expected a joint that moves'),
     (URDF.replace('type="revolute"', 'type="floating"', 1), {}, 'moves in 6 directions'),
@@ -196,6 +195,7 @@ def test_samples_that_nearly_coincide_are_no_jump_and_do_no_harm(free, number, a
     (lambda tau, g, load: -tau, {}, 'the efforts of all joints have the wrong sign'),
     (lambda tau, g, load: tau * [1, -1, 1], {}, 'the effort of shoulder has the wrong sign'),
     (lambda tau, g, load: tau - g, {}, 'effort to gravity_compensated'),
+    (lambda tau, g, load: 0 * g, {'effort': 'gravity_compensated'}, 'all efforts are zero'),
     (lambda tau, g, load: tau, {'effort': 'gravity_compensated'}, 'effort to torque'),
     (lambda tau, g, load: tau, {'gravity': [0.0, 0.0, -9.8]}, 'as if it were [3.98, 5.0'),
     (lambda tau, g, load: tau + load, {}, 'parameter payload to [1.'),

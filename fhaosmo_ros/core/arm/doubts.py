@@ -54,6 +54,8 @@ class Doubts:
         """Return what explains the torque, if something does."""
         count, mean, square, both, own, squares, normal, seen = self._sums
         moved = np.max(square / count - (mean / count) ** 2) > MOVED**2
+        if moved and not own.any():
+            return 'all efforts are zero: does the driver measure them?'
         if not moved or np.mean(squares) < LARGE**2 * count:
             return ''
 
