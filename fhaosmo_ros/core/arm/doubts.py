@@ -75,7 +75,8 @@ class Doubts:
             cosine = gravity @ known / (size * (known @ known))
             if size < 0.3:
                 return (
-                    'effort has no gravity in it: set the parameter effort to gravity_compensated'
+                    'effort has hardly any gravity in it: set the parameter effort to '
+                    'gravity_compensated, or to current'
                 )
             if not self._with_gravity:
                 return 'effort has gravity in it: set the parameter effort to torque'
