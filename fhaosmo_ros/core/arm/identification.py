@@ -179,6 +179,10 @@ class _Regression:
         acceleration = np.gradient(velocity, period, axis=0)
         edge, every = int(0.5 / period), max(1, round(1.0 / (ROWS * period)))
         kept = slice(edge, len(even) - edge, every)
+        if not np.any(np.abs(velocity) > STILL):
+            raise ConfigurationError(
+                f'recording: expected joints that move, got none faster than {STILL:g} rad/s'
+            )
         self.t, smooth, effort = even[kept], smooth[kept], low(effort, CUTOFF)[kept]
         own = np.array([acceleration, np.ones_like(velocity), velocity, *rubbing])[:, kept]
         acceleration, _, self.velocity = own[:3]

@@ -9,7 +9,7 @@ from typing import Any
 
 from fhaosmo_ros.core.arm import identification
 from fhaosmo_ros.core.arm.arm import Arm
-from fhaosmo_ros.core.arm.model import Floats
+from fhaosmo_ros.core.arm.model import Calibration, Floats
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.stop_signals import Stop
 from fhaosmo_ros.tools.arm.replay import add_options, arm_parameters, description, joint_samples
@@ -82,6 +82,12 @@ def _calibrate(arguments: argparse.Namespace, stop: Stop) -> None:
             given = np.array(arm.parameters['torque_constants'])
             constants = np.where(given == 1.0, 0.0, given)
         found = identification.identify(arm.model, t, q, torque, torque_constants=constants)
+        # What the node says of this motion without calibration, of a wrong sign say.
+        urdf_alone = replace(
+            Calibration.of_urdf(arm.model), torque_constants=found.calibration.torque_constants
+        )
+        alone = Arm(urdf, values, calibration=urdf_alone)
+        alone.run(t, q, effort, *velocity)
         # The log-odds of contact that this free motion reaches once a minute.
         free = Arm(urdf, values, calibration=found.calibration)
         odds = np.nan_to_num(free.run(t, q, effort, *velocity).log_odds, nan=-np.inf)
@@ -90,7 +96,9 @@ def _calibrate(arguments: argparse.Namespace, stop: Stop) -> None:
         level = max(float(peaks[len(peaks) // 60]), LEAST)
     print('In parts of the recording that were held out:')
     print(_table(arm.joints, 'URDF', 'calibrated', found.before, found.after))
-    print(*found.notes, sep='\n')
+    unused = [f'{what}: {n} samples' for what, n in free.counters.items() if what != 'used']
+    doubt = [f'By the URDF alone: {alone.doubts.text}'] if alone.doubts.text else []
+    print(*found.notes, *unused, *doubt, sep='\n')
     with output_at(arguments.output, arguments.force, arguments.bag) as path:
         text = replace(found.calibration, log_odds=level).dumps()
         path.write_text(text, encoding='utf-8')
