@@ -332,13 +332,14 @@ cdef class SelfTuning(Structure):
 
         Samples wait for a busy host, which stamps them as it reads them. So the time since the
         last sample that was used may be the usual one; or, if that sample was late, the one of the
-        stamps alone, where this is nearly the usual one.
+        stamps alone, where this is nearly the usual one. Where all are late, times still go with
+        the stamps in the mean.
         """
         cdef Memory* memory = &self.memory
         cdef double usual = (memory.beyond + 1.0) * self.members.shared.usual_interval
         cdef double passed = h - memory.behind, likelihood
         if memory.behind == 0.0 or not 0.5 * usual < passed < 2.0 * usual:
-            passed = usual
+            passed = usual + memory.behind / NOISE_SAMPLES
         likelihood = self.likelihood()
         self.look(y, passed, u)
         if is_likely(self.members, gate, 0.0) and self.likelihood() > likelihood:
@@ -352,7 +353,7 @@ cdef class SelfTuning(Structure):
         cdef Work* w = &self.members.work
         cdef int g = self.members.shared.likeliest
         cdef double variance = w.s[g] * w.noise[g]
-        return -w.b[g] * w.b[g] / variance - log(variance)
+        return -w.b[g] * w.b[g] / variance - log(variance / self.members.shared.first_noise)
 
     cdef void follow_period(self, double h, bint same) noexcept nogil:
         """Decide which covariances move, and what depends on the period (D 27)."""
