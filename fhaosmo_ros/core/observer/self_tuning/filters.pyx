@@ -19,8 +19,9 @@ cdef double HUBER = 3.0  # innovations of more standard deviations count as so m
 # y and its stamps are taken to be no more exact than this: in parts of what y moves between
 # samples (RMS), and of the period.
 cdef double EXACT = 1e-5
-# By this factor S is too large, so that P stays positive where y is by many orders of magnitude
-# more exact than its prediction: what is left of P then is more than what rounding makes of it.
+# By this factor S is too large, and so are variances that are raised after a jump, so that P stays
+# positive where y is by many orders of magnitude more exact than its prediction: what is left of P
+# then is more than what rounding makes of it.
 cdef double INEXACT = 1.0 + EXACT * EXACT
 
 
@@ -242,13 +243,14 @@ cdef VECTORISED allow_jump(Members* m, double y, double tau) noexcept nogil:
         w.two[g] = square - variance if square > HUBER * HUBER * variance else 0.0
         w.s[g] = INEXACT * (variance + w.two[g]) / w.one[g]
         if tau == 0.0:
-            w.two[g] = 1.0 + w.two[g] / w.p.zz[0][g]
+            w.two[g] = 1.0 + (w.two[g] / w.p.zz[0][g] if w.p.zz[0][g] > 0.0 else 0.0)
     for i in range(n + ORDERS):
         for j in range(i, n + ORDERS):
             row = entry(&w.p, n, i, j)
             if tau == 0.0:
+                part = INEXACT if i == j else 1.0
                 for g in range(active):
-                    row[g] *= w.two[g]
+                    row[g] *= part * w.two[g]
             elif j <= n:  # at its begin, or at any time of it
                 part = factorial(n) / factorial(n - i) * factorial(n) / factorial(n - j)
                 part *= 0.5 + 0.5 * (2.0 * n + 1.0) / (2.0 * n + 1.0 - i - j)
@@ -278,8 +280,8 @@ cdef VECTORISED correct(Members* m, bint by_interval) noexcept nogil:
         m.variance[g] = w.s[g]
     if not by_interval and first < last:
         fill(w.one, m.used_noise)
-        for g in range(first, last):
-            w.inverse[g] = w.taken[g] = 1.0 / (w.s[g] * w.one[g])
+        for g in range(first, last):  # where rounding has made z_1 certain, nothing is taken
+            w.inverse[g] = w.taken[g] = (1.0 if w.s[g] > INEXACT else 0.0) / (w.s[g] * w.one[g])
         for g in range(first, last):
             m.log_variance[g] = log(w.s[g])
     for i in range(n + ORDERS):

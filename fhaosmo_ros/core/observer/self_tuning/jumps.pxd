@@ -3,6 +3,8 @@
 
 from fhaosmo_ros.core.observer.self_tuning.members cimport Members
 
+cdef double SMOOTHEST
+
 cdef void begin_growth(Members* m) noexcept nogil
 cdef bint has_jumped(Members* m, double beyond) noexcept nogil
 cdef void watch(Members* m, int member) noexcept nogil

@@ -10,7 +10,8 @@ from fhaosmo_ros.core.observer.self_tuning.filters cimport (
 )
 from fhaosmo_ros.core.observer.self_tuning.intervals cimport choose_members, take_interval
 from fhaosmo_ros.core.observer.self_tuning.jumps cimport (
-    begin_growth, follow_innovations, follow_jump, has_jumped, samples_since_jump, shift, watch
+    SMOOTHEST, begin_growth, follow_innovations, follow_jump, has_jumped, samples_since_jump, shift,
+    watch
 )
 from fhaosmo_ros.core.observer.self_tuning.members cimport (
     BANDS, CLOCKS, COLOURS, COUNT, DECAY, DIFFERENCES, FIRST_SAMPLES, GRID, HALF, IN_BAND, Line,
@@ -224,7 +225,7 @@ cdef class SelfTuning(Structure):
         cdef Memory* memory = &self.memory
         cdef double mean[MOST_STATES]
         cdef double expected, since = 0.0, speed, change, late, gate, off
-        cdef bint goes_on, likely, begins, jumped, rough, even
+        cdef bint goes_on, likely, begins, jumped, rough, smooth, even
         cdef int i, since_jump = 0
         sample.quanta = rounding(m)
         if choose_members(m, sample.quanta):
@@ -258,7 +259,9 @@ cdef class SelfTuning(Structure):
         expected = w.believed[shared.likeliest] * w.noise[shared.likeliest]
         shared.recent = fmax(shared.recent - 1.0, 0.0)
         begins = begins and not likely
-        jumped = begins or (shared.recent > 0.0 and not rough)
+        # After a jump y moves less smoothly than before, but farther than noise would put it off.
+        smooth = fabs(sample.off) > SMOOTHEST * sqrt(sample.uneven)
+        jumped = begins or (shared.recent > 0.0 and (smooth or not rough))
         if not likely and not jumped:
             self.pass_over()
             self.trial_variances[0] = expected
