@@ -10,8 +10,8 @@ from fhaosmo_ros.core.observer.self_tuning.filters cimport (
 )
 from fhaosmo_ros.core.observer.self_tuning.intervals cimport choose_members, take_interval
 from fhaosmo_ros.core.observer.self_tuning.jumps cimport (
-    SMOOTHEST, begin_growth, follow_innovations, follow_jump, has_jumped, samples_since_jump, shift,
-    watch
+    SMOOTHEST, begin_growth, follow_innovations, follow_jump, has_jumped, samples_since_jump,
+    shift, watch
 )
 from fhaosmo_ros.core.observer.self_tuning.members cimport (
     BANDS, CLOCKS, COLOURS, COUNT, DECAY, DIFFERENCES, FIRST_SAMPLES, GRID, HALF, IN_BAND, Line,
