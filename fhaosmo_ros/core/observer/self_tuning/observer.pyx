@@ -19,7 +19,8 @@ from fhaosmo_ros.core.observer.self_tuning.members cimport (
 )
 from fhaosmo_ros.core.observer.self_tuning.noise cimport (
     APART, FADED, ROUNDED, STEADY, bound_of_noise, fill_noise, find_knowing, follow_differences,
-    follow_noise, follow_quantum, follow_stamps, is_even, is_likely, periods, rounding
+    follow_noise, follow_quantum, follow_stamps, follow_usual_interval, is_even, is_likely,
+    rounding
 )
 from fhaosmo_ros.core.observer.self_tuning.start cimport gather
 from fhaosmo_ros.core.observer.self_tuning.weights cimport (
@@ -247,14 +248,15 @@ cdef class SelfTuning(Structure):
         gate = HUBER if goes_on else GATE
         likely = is_likely(m, gate, late)
         off = fabs(memory.interval - shared.usual_interval)
+        # No host hangs at each sample, and samples wait only where one did: else the rate is new.
+        if memory.interval > shared.usual_interval or memory.behind <= 0.0:
+            off = fmin(off, fabs(change))
         if even and (not likely or off > fmax(
             0.5 * shared.usual_interval, HUBER * sqrt(2.0 * shared.jitter)
         )):
             likely = self.is_stamped_late(y, h, u, gate) or likely
-        if likely and memory.beyond == 0.0 and self.passed > 0.5 * shared.usual_interval:
-            shared.usual_interval += (
-                self.passed / periods(m, self.passed) - shared.usual_interval
-            ) / sample.average
+        if likely and memory.beyond == 0.0:
+            follow_usual_interval(m, memory.interval)
         begins = has_jumped(m, memory.beyond)
         expected = w.believed[shared.likeliest] * w.noise[shared.likeliest]
         shared.recent = fmax(shared.recent - 1.0, 0.0)
