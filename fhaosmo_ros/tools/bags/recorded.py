@@ -9,6 +9,7 @@ at its begin and at its end. What was published together is found by its stamps 
 from collections.abc import Iterator, Mapping, Sequence
 from heapq import merge
 from typing import Any, NamedTuple
+import warnings
 
 from fhaosmo_ros.core.model.triangular import TriangularModel
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
@@ -74,12 +75,19 @@ class BagInputs:
 
         Samples and inputs are taken in the order of the bag, as the node takes them in that of
         arrival; values that are not finite are left out. `held` are the inputs before the first
-        ones in the bag, else 0.
+        ones in the bag, else 0; of an input that nobody published, all the time, as in the node.
         """
         names = self._model.inputs
         pairing = Pairing(self._values, names, self._u, held or [0.0] * len(names))
         arrivals = [_arrivals(samples, SAMPLE)]
         for name, its in self._u.items():
+            if not self._reader.count(its.topic):
+                value = held[names.index(name)] if held else 0.0
+                warnings.warn(
+                    f'the bag has no messages on {its.topic}: {name} is held at {value:g}',
+                    stacklevel=2,
+                )
+                continue
             field = self._reader.field(its.topic, its.field, its.name)
             found = self._reader.samples(its.topic, field, its.stamp)
             good = found.part(np.isfinite(found.values))
