@@ -13,10 +13,10 @@ RUN apt-get update \
 WORKDIR /ws
 COPY . src/fhaosmo_ros
 
-# rosdep would install rosbags by a pip that Ubuntu refuses.
+# rosdep would install rosbags by a pip that Ubuntu refuses, and has no key for mcap.
 RUN python3 -m venv --system-site-packages venv \
     && touch venv/COLCON_IGNORE \
-    && venv/bin/pip install --no-cache-dir 'rosbags>=0.11.9,<0.12'
+    && venv/bin/pip install --no-cache-dir 'mcap>=1.6,<1.7' zstandard 'rosbags>=0.11.9,<0.12'
 
 # hadolint ignore=SC1091
 RUN . venv/bin/activate \

@@ -3,18 +3,17 @@
 
 from xml.etree import ElementTree
 
+from fhaosmo_ros.topics import TYPED_ESTIMATES
 import pytest
 from rclpy.node import NodeNameNonExistentError
 from running import ROOT
 
 KNOWN_INPUT = {'phi': ['0', '0', 'u - z3']}
 NODES = {
-    'estimator': {'gains': 'self_tuning', **KNOWN_INPUT}, 'plant': KNOWN_INPUT,
-    'arm': {'wrench_frame': 'tool'},
+    'estimator': {'gains': 'self_tuning', 'typed_outputs': [*TYPED_ESTIMATES], **KNOWN_INPUT},
+    'plant': KNOWN_INPUT, 'arm': {'wrench_frame': 'tool'},
 }  # fmt: skip
 """With what makes them have all that is optional."""
-
-
 POLICY = ElementTree.parse(ROOT / 'config' / 'sros2_policy.xml').getroot()
 
 
