@@ -34,10 +34,10 @@ OTHERS: dict[str, dict[str, Any]] = {
 }  # fmt: skip
 """Observers that go through the same y: how their parameters differ from those of the file."""
 WORDS = """\
-RMS error: of the estimate minus the truth. Chatter: how much further the estimate moves than the
-truth does (1: no chatter). The first observer ran live; the others went through the same y
-afterwards, by the same code. Self-tuning is not the paper's observer: it is a bank of Kalman
-filters that is told the model alone."""
+RMS: of the estimate; RMS error: of it minus the truth. Chatter: how much further the estimate
+moves than the truth does (1: no chatter). The first observer ran live; the others went through
+the same y afterwards, by the same code. Self-tuning is not the paper's observer: it is a bank of
+Kalman filters that is told the model alone."""
 START_DEADLINE = 60.0
 """Seconds for a node to appear; it takes one or two where nothing else runs."""
 NOISE = 'now with noise of 1e-4 on y', {'noise_std': 1e-4}
@@ -100,6 +100,9 @@ def _demo(arguments: argparse.Namespace, stop: Stop) -> None:
         text = report(curves, marks)
         (folder / 'report.txt').write_text(text + '\n', encoding='utf-8')
         print(f'\n{text}\n')
+        for line in (folder / 'estimator.log').read_text(encoding='utf-8').splitlines():
+            if '[WARN]' in line or '[ERROR]' in line:
+                print(line)
     print(f'figure:  {final / "demo.png"}\nbag:     {final / "bag"}')
 
 

@@ -295,7 +295,7 @@ def draw_band(
 def _draw_innovations(axes: Axes, t: Floats, eps: Floats, epsilon: float | None) -> None:
     """Draw |eps_1| .. |eps_N| on a logarithmic scale, and the band within which gates open."""
     size = np.abs(eps)
-    for k in range(eps.shape[1]):
+    for k in np.flatnonzero(size.any(axis=0)):  # a self-tuning estimator has the first one alone
         axes.semilogy(*envelope(t, size[:, k]), linewidth=0.8, label=f'ε{k + 1}')
     size = size[size > 0.0]
     if len(size):
@@ -304,4 +304,5 @@ def _draw_innovations(axes: Axes, t: Floats, eps: Floats, epsilon: float | None)
         low, high = axes.get_ylim()
         axes.axhspan(low, epsilon, color='grey', alpha=0.15, label='band ε')
         axes.set_ylim(low, max(high, 3.0 * epsilon))
-    axes.legend(loc='upper right', ncols=5, fontsize='small')
+    if axes.get_legend_handles_labels()[0]:
+        axes.legend(loc='upper right', ncols=5, fontsize='small')
