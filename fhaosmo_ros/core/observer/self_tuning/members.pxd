@@ -100,8 +100,6 @@ cdef struct Shared:
     double unsettled  # time since covariances began to move (s)
     double steady_period  # interval that they are those of (s)
     double usual_interval  # between samples that were not stamped late (s)
-    double gathered  # time since the sample that it was last followed by (s)
-    double waiting  # samples since then
     double flow_period  # interval that the flow is that of (s)
     double first_noise  # variance of the noise when the members began
     double roughness  # short mean of the squared differences of y, over their usual size

@@ -17,7 +17,7 @@ cdef double usual_speed(Members* m) noexcept nogil
 cdef double share_of_stamps(Members* m, double share, double most) noexcept nogil
 cdef double bound_of_noise(Members* m, int colour, int order) noexcept nogil
 cdef void follow_differences(Members* m, double y, double h) noexcept nogil
-cdef void follow_usual_interval(Members* m, double interval) noexcept nogil
+cdef double periods(Members* m, double interval) noexcept nogil
 cdef void follow_stamps(Members* m, double interval, double change) noexcept nogil
 cdef VECTORISED fill_noise(Members* m) noexcept nogil
 cdef VECTORISED find_knowing(Members* m, bint unlikely_before) noexcept nogil

@@ -19,8 +19,7 @@ from fhaosmo_ros.core.observer.self_tuning.members cimport (
 )
 from fhaosmo_ros.core.observer.self_tuning.noise cimport (
     APART, FADED, ROUNDED, STEADY, bound_of_noise, fill_noise, find_knowing, follow_differences,
-    follow_noise, follow_quantum, follow_stamps, follow_usual_interval, is_even, is_likely,
-    rounding
+    follow_noise, follow_quantum, follow_stamps, is_even, is_likely, periods, rounding, usual_speed
 )
 from fhaosmo_ros.core.observer.self_tuning.start cimport gather
 from fhaosmo_ros.core.observer.self_tuning.weights cimport (
@@ -59,8 +58,7 @@ RANGES |= dict.fromkeys((
     'residual', 'score_before', 'z', 'd', 'gain_z', 'gain_d', 'p_zz', 'p_zd', 'p_dd',
 ), (-LARGEST, LARGEST))
 # What counts before the members run, too.
-EARLY = ('first_y', 'first_h', 'noise', 'late', 'used_noise', 'latest_y', 'ages', 'difference')
-EARLY += ('rough', 'window')
+EARLY = 'first_y', 'first_h'
 
 
 cdef class SelfTuning(Structure):
@@ -226,7 +224,7 @@ cdef class SelfTuning(Structure):
         cdef Memory* memory = &self.memory
         cdef double mean[MOST_STATES]
         cdef double expected, since = 0.0, speed, change, late, gate, off
-        cdef bint goes_on, likely, begins, jumped, rough, smooth, even
+        cdef bint goes_on, likely, begins, jumped, rough, smooth, even, waited
         cdef int i, since_jump = 0
         sample.quanta = rounding(m)
         if choose_members(m, sample.quanta):
@@ -255,8 +253,11 @@ cdef class SelfTuning(Structure):
             0.5 * shared.usual_interval, HUBER * sqrt(2.0 * shared.jitter)
         )):
             likely = self.is_stamped_late(y, h, u, gate) or likely
-        if likely and memory.beyond == 0.0:
-            follow_usual_interval(m, memory.interval)
+        waited = memory.behind > 0.0 and self.passed <= 0.5 * shared.usual_interval
+        if likely and memory.beyond == 0.0 and not waited:
+            shared.usual_interval += (
+                self.passed / periods(m, self.passed) - shared.usual_interval
+            ) / sample.average
         begins = has_jumped(m, memory.beyond)
         expected = w.believed[shared.likeliest] * w.noise[shared.likeliest]
         shared.recent = fmax(shared.recent - 1.0, 0.0)
@@ -312,6 +313,8 @@ cdef class SelfTuning(Structure):
         sample.kept = exp(-h / self.forgetting if self.forgetting > 0.0 else -1.0 / MEMORY)
         self.carry_flow(h, u, same)
         speed = (self.prediction.z[0] - self.level[0].z_hat) / h
+        if not shared.jitter * speed * speed <= LARGEST:  # of a prediction that has overflowed
+            speed = sqrt(usual_speed(m))
         shared.of_stamps = shared.jitter * speed * speed
         fill_noise(m)
         self.follow_period(h, same)
@@ -485,8 +488,7 @@ cdef class SelfTuning(Structure):
             'difference': (<size_t>m.difference, (CLOCKS, DIFFERENCES)),
             'rough': (<size_t>m.rough, (CLOCKS, COLOURS, DIFFERENCES)),
             'window': (<size_t>m.window, (WINDOW,)),
-            'flow': (<size_t>m.flow, (MOST_STATES, MOST_STATES)),
-        }
+        } | ({'flow': (<size_t>m.flow, (MOST_STATES, MOST_STATES))} if self.is_linear else {})
 
     def state_dict(self):
         """
@@ -499,10 +501,11 @@ cdef class SelfTuning(Structure):
         for name, (at, shape) in self.places().items():
             numbers = np.frombuffer((<char*><size_t>at)[:8 * int(np.prod(shape))])
             found[name] = numbers.reshape(shape)
-        if not all((np.abs(numbers) <= LARGEST).all() for numbers in found.values()):
-            shared['samples'] = 0  # members are lost, as the next step would find
+        early = {name: found[name] for name in EARLY}
         if shared['samples'] <= FIRST_SAMPLES:
-            found = {name: found[name] for name in EARLY}
+            found = early
+        if not all((np.abs(numbers) <= LARGEST).all() for numbers in found.values()):
+            shared['samples'], found = 0, early  # members are lost, as the next step would find
         found |= shared
         for name, numbers in found.items():
             found[name] = np.clip(np.nan_to_num(numbers), *RANGES.get(name, (0.0, LARGEST)))
@@ -527,6 +530,8 @@ cdef class SelfTuning(Structure):
         variances = array_of(values, 'variances', (self.levels,), 0.0, INFINITY)
         numbers = array_of(values, 'model', (4,))
         Structure.load_state_dict(self, values)
+        if shared.samples <= FIRST_SAMPLES:
+            self.begin_afresh()
         self.members.shared, self.members.work.q_interval = shared, 0.0
         self.model = Model(numbers[0], numbers[1], numbers[2], numbers[3])
         self.y_jumped = False

@@ -201,6 +201,9 @@ cdef void begin(Members* m, double noise) noexcept nogil:
     shared.roughness = 1.0
     for j in range(1, FIRST_SAMPLES):
         follow_differences(m, m.first_y[j], m.first_h[j])
+    memset(m.flow, 0, sizeof(m.flow))  # of members that were lost it may be anything
+    memset(m.decayed, 0, sizeof(Line))
+    memset(&m.gain, 0, sizeof(Estimates))
     memset(&m.x, 0, sizeof(Estimates))
     memset(m.p.zz, 0, n * (n + 1) // 2 * sizeof(Line))
     memset(m.p.zd, 0, n * ORDERS * sizeof(Line))
