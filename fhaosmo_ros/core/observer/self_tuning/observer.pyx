@@ -224,7 +224,7 @@ cdef class SelfTuning(Structure):
         cdef Memory* memory = &self.memory
         cdef double mean[MOST_STATES]
         cdef double expected, since = 0.0, speed, change, late, gate, off
-        cdef bint goes_on, likely, begins, jumped, rough, smooth, even, waited
+        cdef bint goes_on, likely, begins, jumped, rough, smooth, even
         cdef int i, since_jump = 0
         sample.quanta = rounding(m)
         if choose_members(m, sample.quanta):
@@ -253,8 +253,7 @@ cdef class SelfTuning(Structure):
             0.5 * shared.usual_interval, HUBER * sqrt(2.0 * shared.jitter)
         )):
             likely = self.is_stamped_late(y, h, u, gate) or likely
-        waited = memory.behind > 0.0 and self.passed <= 0.5 * shared.usual_interval
-        if likely and memory.beyond == 0.0 and not waited:
+        if likely and memory.beyond == 0.0 and self.passed > 0.5 * shared.usual_interval:
             shared.usual_interval += (
                 self.passed / periods(m, self.passed) - shared.usual_interval
             ) / sample.average
