@@ -27,6 +27,8 @@ cdef class SelfTuning(Structure):
     # Parts of a step.
     cdef void step_members(self, double y, double h, const double* u) noexcept nogil
     cdef double look(self, double y, double h, const double* u) noexcept nogil
+    cdef bint may_have_waited(self, double change) noexcept nogil
+    cdef void follow_usual_interval(self) noexcept nogil
     cdef bint is_stamped_late(
         self, double y, double h, const double* u, double gate
     ) noexcept nogil

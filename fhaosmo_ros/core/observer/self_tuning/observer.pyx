@@ -223,7 +223,7 @@ cdef class SelfTuning(Structure):
         cdef Sample* sample = &w.sample
         cdef Memory* memory = &self.memory
         cdef double mean[MOST_STATES]
-        cdef double expected, since = 0.0, speed, change, late, gate, off
+        cdef double expected, since = 0.0, speed, change, late, gate
         cdef bint goes_on, likely, begins, jumped, rough, smooth, even
         cdef int i, since_jump = 0
         sample.quanta = rounding(m)
@@ -245,18 +245,10 @@ cdef class SelfTuning(Structure):
         )
         gate = HUBER if goes_on else GATE
         likely = is_likely(m, gate, late)
-        off = fabs(memory.interval - shared.usual_interval)
-        # No host hangs at each sample, and samples wait only where one did: else the rate is new.
-        if memory.interval > shared.usual_interval or memory.behind <= 0.0:
-            off = fmin(off, fabs(change))
-        if even and (not likely or off > fmax(
-            0.5 * shared.usual_interval, HUBER * sqrt(2.0 * shared.jitter)
-        )):
+        if even and (not likely or self.may_have_waited(change)):
             likely = self.is_stamped_late(y, h, u, gate) or likely
-        if likely and memory.beyond == 0.0 and self.passed > 0.5 * shared.usual_interval:
-            shared.usual_interval += (
-                self.passed / periods(m, self.passed) - shared.usual_interval
-            ) / sample.average
+        if likely and memory.beyond == 0.0:
+            self.follow_usual_interval()
         begins = has_jumped(m, memory.beyond)
         expected = w.believed[shared.likeliest] * w.noise[shared.likeliest]
         shared.recent = fmax(shared.recent - 1.0, 0.0)
@@ -330,6 +322,27 @@ cdef class SelfTuning(Structure):
         expect(m, h, y)
         find_knowing(m, self.memory.beyond > 0.0)
         return speed
+
+    cdef bint may_have_waited(self, double change) noexcept nogil:
+        """
+        Return True if an interval, and its change, are those of a sample that has waited (D 29).
+
+        No host hangs at each sample, and samples wait only where one did: else the rate is new.
+        """
+        cdef Shared* shared = &self.members.shared
+        cdef double usual = shared.usual_interval
+        cdef double off = fabs(self.memory.interval - usual)
+        if self.memory.interval > usual or self.memory.behind <= 0.0:
+            off = fmin(off, fabs(change))
+        return off > fmax(0.5 * usual, HUBER * sqrt(2.0 * shared.jitter))
+
+    cdef void follow_usual_interval(self) noexcept nogil:
+        """Follow the usual interval by a sample that is used, unless it is one of a burst."""
+        cdef Members* m = self.members
+        if self.passed > 0.5 * m.shared.usual_interval:
+            m.shared.usual_interval += (
+                self.passed / periods(m, self.passed) - m.shared.usual_interval
+            ) / m.work.sample.average
 
     cdef bint is_stamped_late(
         self, double y, double h, const double* u, double gate
