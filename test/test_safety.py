@@ -41,7 +41,8 @@ KINDS = {
         'gains': 'fixed', 'measurement_delay': 0.01, 'input_delay': 0.002, 'predict_to_now': True,
         'stuck_time': 0.1, 'spike_gate': 0.5,
     },
-    'smoothed': {'phi': ['0', '0', 'sqrt(z1-.12)'], 'gains': 'self_tuning', 'smoothing_lag': 0.05},
+    'smoothed': SECOND_ORDER | {'gains': 'self_tuning', 'smoothing_lag': 0.05},
+    'infinite': {'phi': ['0', '0', 'sqrt(z1-.12)'], 'gains': 'self_tuning', 'smoothing_lag': 0.05},
     'clock': {'sampling': 'clock', 'event_threshold': 0.05},
 }  # fmt: skip
 """Parameters that reach all of the core."""
