@@ -12,6 +12,7 @@ import copy
 import math
 import os
 import pickle
+import time
 
 from fhaosmo_ros.core import ConfigurationError, OnlineEstimator, Plant
 from fhaosmo_ros.core.arm.samples import Samples
@@ -109,11 +110,12 @@ def test_hostile_snapshots(kind):
 
 @pytest.mark.parametrize('kind', ['cascade', 'self-tuning'])
 def test_two_threads_on_one_estimator_get_an_error(kind):
-    estimator, stamps = running(KINDS[kind], 100, 1), 2 * 10**9 + np.arange(20_000) * 10**6
-    refused = pytest.raises(RuntimeError, match='another thread')
+    estimator, stamps = running(KINDS[kind], 100, 1), 2 * 10**9 + np.arange(200_000) * 10**6
+    y, refused = 0.1 * np.sin(stamps * 3e-9), pytest.raises(RuntimeError, match='another thread')
+    deadline = time.monotonic() + 60.0
     with refused, ThreadPoolExecutor(1) as other:
-        for _ in range(100):
-            run = other.submit(estimator.run, stamps, np.zeros(len(stamps)))
+        while time.monotonic() < deadline:
+            run = other.submit(estimator.run, stamps, y)
             while not run.done():
                 estimator.update(0, 0.1)
             run.result()
