@@ -166,9 +166,10 @@ cdef void follow_differences(Members* m, double y, double h) noexcept nogil:
     cdef double now[DIFFERENCES]
     cdef double least = ROUNDED * m.shared.first_noise, unit = m.shared.steady_period
     cdef double bound = INFINITY, white, r, grown, average = ROUGH_SAMPLES
+    cdef double most = HUBER * HUBER, usual = CLIPPED
     cdef int p, c, clock, order = m.n + 1
-    if m.shared.grown > STEADY:
-        average = QUICK_SAMPLES
+    if m.shared.grown > STEADY:  # no outliers then, but noise of another size
+        average, most, usual = QUICK_SAMPLES, 1.0 / ROUNDED, 1.0
     sample.roughness, sample.roughness_before = 0.0, m.shared.roughness
     for p in range(order, 0, -1):
         m.latest_y[p], m.ages[p] = m.latest_y[p - 1], m.ages[p - 1] + fmax(h, EXACT * unit)
@@ -183,7 +184,7 @@ cdef void follow_differences(Members* m, double y, double h) noexcept nogil:
                 r = white * white / m.rough[clock][c][p]
                 if clock == 1 and c == 0 and m.rough[1][0][p] < bound:
                     bound, sample.roughness = m.rough[1][0][p], r
-                grown = 1.0 + (fmin(r, HUBER * HUBER) / CLIPPED - 1.0) / average
+                grown = 1.0 + (fmin(r, most) / usual - 1.0) / average
                 m.rough[clock][c][p] = fmax(m.rough[clock][c][p] * grown, least)
             m.difference[clock][p] = now[p]
     sample.uneven = now[order] * now[order]
