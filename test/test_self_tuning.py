@@ -77,7 +77,7 @@ def test_it_finds_noise_and_d(case, name):
     assert rms(error[5000:]) < bar * rms(d)
     assert error.max() < 1.5 * np.abs(d).max()
     assert not (run.status & Status.JUMPED).any()
-    assert observer.tuning.noise == pytest.approx(size, rel=0.2)
+    assert observer.tuning.noise == pytest.approx(size, rel=0.3 if name == 'heavy tails' else 0.2)
     assert observer.tuning.correlation == pytest.approx(correlation, abs=0.05)
     if name in ('little', 'usual'):
         expected = run.standard_deviation[5000:, 3]
@@ -158,6 +158,20 @@ def test_little_noise_or_none(noise, period):
         assert abs(run.unknown_input).max() < 5.0 * 70.0  # a limit cycle has 8
         if noise and period == PERIOD:  # a large d is not taken for noise
             assert observer.tuning.noise == pytest.approx(noise, rel=0.3)
+
+
+@pytest.mark.parametrize('noise', [4.4e-5, 4.4e-4])
+def test_noise_that_begins_where_there_was_none_is_seldom_taken_for_d(noise):
+    """Its first samples may look like a jump of d, in few runs."""
+    t, y, d = (values[:12_000] for values in swept())
+    peaks, errors = [], []
+    for seed in range(12):
+        noisy = noise * np.random.default_rng(seed).standard_normal(2_200)
+        found = Observer(MOTOR).run(t, np.append(y[:9_800], y[9_800:] + noisy)).unknown_input
+        peaks.append(np.abs(found).max() / np.abs(d).max())
+        errors.append(rms((found - d)[9_800:]) / rms(d))
+    assert np.median(peaks) < 1.5
+    assert max(errors) < 1.5
 
 
 @pytest.mark.parametrize('seed', [0, 2, 4])
