@@ -250,6 +250,19 @@ def test_a_usual_jump_of_d_is_believed_at_the_second_sample_and_two_outliers_are
     assert wrong[3500:3550].max() < 0.1
 
 
+@pytest.mark.parametrize('noise', [1e-7, 1e-5, 1e-4])
+@pytest.mark.parametrize('order', [3, 4, 5])
+def test_a_moving_y_that_freezes_is_no_jump_of_d(order, noise):
+    """It is off by a time, as after a blow, and not by its power `order` (D 33)."""
+    rng = np.random.default_rng(order)
+    d, t = 0.7 * matern(12_000, 1.5, 2, rng), np.arange(12_000) * PERIOD
+    model = np.diag(np.ones(order - 1), 1)
+    y = states_of(model, d, [0.2] * order)[:, 0] + noise * rng.standard_normal(len(t))
+    y[9_000:9_050] = y[9_000]
+    found = Observer(SELF_TUNING, order=order, phi=['0'] * order).run(t, y).unknown_input
+    assert np.abs(found - d).max() < 1.5 * np.abs(d).max()
+
+
 @pytest.mark.parametrize('counts', [1024, 4096, 65536])
 def test_slow_motion_over_an_encoder(counts):
     """It stands still for most of the time; a count that comes then is no jump of d."""

@@ -20,9 +20,9 @@ from fhaosmo_ros.core.observer.self_tuning.noise cimport FADED, ROUGH
 from fhaosmo_ros.core.observer.structure cimport GATE, LOST_SAMPLES
 
 # Where unlikely samples are farther off than the first one, d may have jumped (D 33). Farther
-# means: so many times as far, and 3 sigma more; and so many times the highest differences of y,
-# which noise does not get to. Differences must not have been larger than usual before, unless y is
-# farther off by the last factor.
+# means: so many times as far at least, and 3 sigma more; and so many times the highest differences
+# of y, which noise does not get to. Differences must not have been larger than usual before, unless
+# y is farther off by the last factor.
 cdef double FARTHER = 1.3, SMOOTH = 5.0, SMOOTHEST = 30.0
 # From one usual value to the opposite one d jumps by so many times its usual size.
 cdef double USUAL_JUMP = 2.0
@@ -30,8 +30,22 @@ cdef double USUAL_JUMP = 2.0
 
 cdef void begin_growth(Members* m) noexcept nogil:
     """Take the first of the unlikely samples in a row."""
-    m.shared.first_off = fabs(m.work.sample.off)
+    m.shared.first_off, m.shared.first_h = fabs(m.work.sample.off), m.work.sample.h
     m.shared.uneven, m.shared.first_rough = m.work.sample.uneven, m.work.sample.roughness_before
+
+
+cdef double farther(Members* m) noexcept nogil:
+    """
+    Return by what factor y has to be farther off than at the first unlikely sample (D 33).
+
+    A jump of d puts y off by tau^n, and a short d by tau^(n - 1), in a time tau that begins after
+    the last sample that was likely, when it was within the gate. A y that freezes while it moves
+    is off by tau: no jump of d, unless n is 2.
+    """
+    cdef Shared* shared = &m.shared
+    cdef double hidden = fmin(GATE * sqrt(m.work.now[0]) / shared.first_off, 1.0)
+    cdef double later = m.work.sample.h / shared.first_h - 1.0
+    return fmax(FARTHER, power(1.0 + later * (1.0 - pow(hidden, 1.0 / m.n)), m.n - 1))
 
 
 cdef bint has_jumped(Members* m, double beyond) noexcept nogil:
@@ -52,7 +66,7 @@ cdef bint has_jumped(Members* m, double beyond) noexcept nogil:
     shared.uneven += (sample.uneven - shared.uneven) / (count + 1.0)
     uneven = sqrt(shared.uneven)
     if count > 0 and off > SMOOTH * uneven and (
-        off > FARTHER * shared.first_off + HUBER * sqrt(m.work.now[0])
+        off > farther(m) * shared.first_off + HUBER * sqrt(m.work.now[0])
     ):
         shared.growing += 1.0
     else:
