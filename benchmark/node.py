@@ -261,7 +261,6 @@ class EmptyNode(Node):
             for topic, kind in topics(node, EMPTY, joints).items()
         ]
         self._stamp = state.header.stamp if node == ARM else made[Time]
-        self.values = {'diagnostics_period': 1.0, 'hardware_id': 'none'}
         publish_diagnostics(self, self._reports)
         self._each = not rate
         if rate:

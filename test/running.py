@@ -35,10 +35,8 @@ ESTIMATES = {
     'state': Float64MultiArray, 'unknown_input': Float64, 'innovation': Float64MultiArray,
     'stamp': Time, 'gamma': Float64,
 }  # fmt: skip
-FED = {'publish_on': 'sample', 'max_gap': 60.0, 'diagnostics_period': 0.1}
+FED = {'publish_on': 'sample', 'max_gap': 60.0}
 """For an estimator that a test feeds: each sample is answered at once, and no gap restarts it."""
-LAX = {'warn_jitter_above': 1e6, 'warn_delay_above': 1e6, 'diagnostics_period': 0.1}
-"""A loaded machine is no reason for a warning here."""
 
 
 def nanoseconds(stamp: Time) -> int:
@@ -57,8 +55,8 @@ def plain(message: Time | Float64 | Float64MultiArray) -> int | float | list[flo
 
 
 def values_of(status) -> dict[str, object]:
-    """Return the values of a diagnostic status, and its own level, message and hardware_id."""
-    own = {name: getattr(status, name) for name in ('level', 'message', 'hardware_id')}
+    """Return the values of a diagnostic status, and its own level and message."""
+    own = {'level': status.level, 'message': status.message}
     return own | {pair.key: pair.value for pair in status.values}
 
 

@@ -91,7 +91,7 @@ class ArmNode(BaseNode):
         self.create_subscription(JointState, values['input_topic'], self._on_sample, SENSOR_QOS)
         for name in SERVICES:
             self.create_service(Trigger, f'~/{name}', partial(self._serve, name))
-        self._diagnostics = diagnostics.publish_diagnostics(self, self._reports)
+        diagnostics.publish_diagnostics(self, self._reports)
 
     def _use(self, urdf: str) -> None:
         """Begin to estimate for this robot."""
@@ -224,7 +224,6 @@ class ArmNode(BaseNode):
     def _adopt(self, values: Parameters) -> None:
         if self._arm is not None:
             self._arm.adopt(values)
-        endpoints.set_period(self._diagnostics, values['diagnostics_period'])
 
     def _serve(self, name: str, _: Any, response: Trigger.Response) -> Trigger.Response:
         response.success = self._estimate is not None

@@ -8,7 +8,7 @@ from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
 import pytest
 
 try:
-    from running import arguments, Estimator, FED, LAX, Parameters, Process, User
+    from running import arguments, Estimator, FED, Parameters, Process, User
 except ModuleNotFoundError:  # no ROS 2 in this Python
     collect_ignore_glob = ['test_*.py']
 
@@ -71,10 +71,10 @@ def estimator(launch, user):
 
 @pytest.fixture(scope='session')
 def pair(tmp_path_factory, user):
-    """Return an estimator that hears a plant; the plant's parameters are its attribute."""
+    """Return an estimator that hears a plant; the plant and its parameters are its attributes."""
     with _launcher(tmp_path_factory) as launch:
-        estimator = Estimator(user, launch('estimator', namespace='/pair', **LAX), '/pair')
-        launch('plant', namespace='/pair', sample_rate=200.0)
+        estimator = Estimator(user, launch('estimator', namespace='/pair'), '/pair')
+        estimator.source = launch('plant', namespace='/pair', sample_rate=200.0)
         estimator.plant = Parameters(user, '/pair/plant')
         yield estimator
 

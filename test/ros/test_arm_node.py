@@ -56,7 +56,7 @@ class Limb(Rig):
 @pytest.fixture(scope='module')
 def limb(launch, user):
     """Return an arm node that has heard its robot's description, and everything around it."""
-    options = {'wrench_frame': 'tool', 'publish_rate': 5000.0, 'diagnostics_period': 0.2}
+    options = {'wrench_frame': 'tool', 'publish_rate': 5000.0}
     limb = Limb(user, launch('arm', namespace='/limb', **options), '/limb')
     limb.wrenches = user.record(f'{limb.name}/external_wrench', WrenchStamped)
     limb.events = user.record(f'{limb.name}/event', DiagnosticArray, LATCHED)

@@ -5,6 +5,7 @@ from functools import partial
 import itertools
 import math
 import re
+import signal
 import time
 
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
@@ -13,7 +14,7 @@ import numpy as np
 import pytest
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
-from running import as_time, ERROR, FED, joint_state, LATCHED, LAX, OK, SECOND, STALE, WARN
+from running import as_time, ERROR, FED, joint_state, LATCHED, OK, SECOND, STALE, WARN
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64, Float64MultiArray, Int64
 from std_srvs.srv import SetBool
@@ -34,29 +35,35 @@ def test_values_of_the_reports(pair):
     assert (found['topic'], observer['open levels']) == ('/pair/y', '4 of 4')
     assert 0.0 < float(found['longest delay [s]']) < 60.0
     assert float(observer['step time, mean [us]']) > 0.0
-    for name in ('encoder 7', 'none'):
-        pair.parameters.set(hardware_id=name)
-        pair.wait_values('state', lambda v, name=name: v['hardware_id'] == name, name)
 
 
-@pytest.mark.parametrize(('task', 'changes', 'words'), [
-    ('input', {'warn_rate_below': 1e4}, ['sample rate']),
-    ('input', {'warn_jitter_above': 0.0}, ['jitter']),
-    ('input', {'warn_delay_above': 0.0}, ['after their stamps']),
-    ('observer', {'epsilon': 1e-12}, ['levels from 2 on hold', 'epsilon']),
+@pytest.mark.parametrize(('who', 'words'), [
+    ('source', 'jitter'), ('process', 'after their stamps'),
 ])  # fmt: skip
-def test_thresholds(pair, task, changes, words):
+def test_a_process_that_stands_still_for_a_moment_is_told(pair, who, words):
+    process = getattr(pair, who)
+
+    def stand_still() -> None:
+        process.send_signal(signal.SIGSTOP)
+        time.sleep(0.3)
+        process.send_signal(signal.SIGCONT)
+
+    pair.wait_status('input', WARN, words, doing=stand_still)
+    pair.wait_status('input', OK, 'OK')
+
+
+def test_levels_on_hold_are_told(pair):
+    changes = {'epsilon': 1e-12, 'divergence_time': 0.0}
     was = pair.parameters.all(changes)
     pair.parameters.set(**changes)
-    pair.wait_status(task, WARN, *words)
+    pair.wait_status('observer', WARN, 'levels from 2 on hold', 'epsilon')
     pair.parameters.set(**was)
-    pair.wait_status(task, OK, 'OK')
+    pair.wait_status('observer', OK, 'OK')
 
 
 def test_what_no_longer_fits_is_said(user, estimator):
     file = ['--params-file', 'config/noise_1e-3.yaml']
-    options = LAX | {'publish_on': 'sample', 'max_gap': 60.0}
-    options |= {'input_topic': 'q', 'input_field': 'position[a]', 'reliable': ['q']}
+    options = FED | {'input_topic': 'q', 'input_field': 'position[a]', 'reliable': ['q']}
     rig = estimator('/fits', *file, **options)
     q = user.publisher('/fits/q', JointState)
     rng, stamp, sent = np.random.default_rng(1), 0, 0
@@ -237,7 +244,7 @@ def clock(user):
 
 
 def test_node_clock_sampling_follows_simulated_time(clock, estimator):
-    rig = estimator('/sim', **FED | LAX, use_sim_time=True, sampling='clock')
+    rig = estimator('/sim', **FED, use_sim_time=True, sampling='clock')
     rig.listen()
     said = 'samples rejected: nothing on /clock yet'
     rig.wait_status('input', STALE, said, doing=lambda: rig.send(0.2))
@@ -276,7 +283,7 @@ def test_node_clock_sampling_follows_simulated_time(clock, estimator):
 
 def test_clocks_that_stand_still_go_back_below_zero_or_jump(user, clock, estimator, launch):
     plant = launch('plant', namespace='/still', use_sim_time=True)
-    rig = estimator('/still', use_sim_time=True, **LAX)
+    rig = estimator('/still', use_sim_time=True)
     assert rig.parameters.get('sampling') == 'clock'
     for process in (plant, rig.process):
         clock(-5 * SECOND, lambda process=process: 'seconds >= 0, got -5' in process.output())

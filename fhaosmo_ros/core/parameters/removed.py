@@ -20,5 +20,10 @@ REMOVED = {
     'divergence_limit': 'leave it out: samples beyond 1e60 are rejected',
     'sines': 'leave it out: a sum has 5 sines',
     'search': "leave it out: 'tune' searches the model of d, or the gains where 'lambda' is set",
+    'diagnostics_period': 'leave it out: reports come every second',
+    'hardware_id': "leave it out: reports have 'none'",
+    'warn_rate_below': 'leave it out: /diagnostics has the sample rate as a number',
+    'warn_jitter_above': 'leave it out: WARN above 0.5',
+    'warn_delay_above': 'leave it out: WARN above 0.1 s',
 }
 """What a message says of a name that was a parameter once."""

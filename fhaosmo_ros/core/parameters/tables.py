@@ -262,20 +262,6 @@ ESTIMATOR_NODE = (
     Parameter('frame_id', '', 'frame_id of these messages.', live=False),
 )  # fmt: skip
 
-DIAGNOSTICS = (
-    Parameter('diagnostics_period', 1.0, 'Time between two reports on /diagnostics, in host time.',
-              unit='s', lower=0.1, upper=60.0),
-    Parameter('hardware_id', 'none', 'hardware_id of the reports: the sensor behind y.'),
-    Parameter('warn_rate_below', 0.0, 'WARN if the sample rate of y is lower. 0: never.',
-              unit='Hz', lower=0.0, upper=1e5),
-    Parameter('warn_jitter_above', 0.5,
-              'WARN if the standard deviation of the sampling period over its mean is higher.',
-              lower=0.0, upper=1e6),
-    Parameter('warn_delay_above', 0.1,
-              'WARN if a sample is taken later than this after its source stamp: a slow host, '
-              'or clocks that differ.', unit='s', lower=0.0, upper=1e6),
-)  # fmt: skip
-
 PLANT_MODEL = (
     Parameter('initial_state', [0.2], 'States z_1 .. z_n at the start.', lower=-1e12, upper=1e12,
               live=False, lengths='1 or n'),
@@ -309,10 +295,10 @@ OBSERVER_PARAMETERS = ParameterTable(MODEL, OBSERVER)
 ONLINE_PARAMETERS = ParameterTable(MODEL, OBSERVER, SAMPLING, EVENTS)
 CHANNEL_PARAMETERS = ParameterTable(MODEL, OBSERVER, SAMPLING, EVENTS, INPUT, CHANNEL_OUTPUT)
 """What each channel of an estimator node may have for itself."""
-ESTIMATOR_PARAMETERS = ParameterTable(CHANNEL_PARAMETERS.declared, ESTIMATOR_NODE, DIAGNOSTICS)
+ESTIMATOR_PARAMETERS = ParameterTable(CHANNEL_PARAMETERS.declared, ESTIMATOR_NODE)
 PLANT_PARAMETERS = ParameterTable(MODEL, PLANT_MODEL)
 PLANT_NODE_PARAMETERS = ParameterTable(MODEL, PLANT_MODEL, PLANT_NODE)
-ARM_NODE_PARAMETERS = ParameterTable(ARM, ARM_NODE, DIAGNOSTICS[:2])
+ARM_NODE_PARAMETERS = ParameterTable(ARM, ARM_NODE)
 NODE_TABLES = {
     'estimator': ESTIMATOR_PARAMETERS,
     'plant': PLANT_NODE_PARAMETERS,

@@ -49,7 +49,7 @@ class EstimatorNode(ManagedNode):
         self._left_out: list[str] = []  # what is said of those that are no channels
         self._channels: list[Channel] = []  # none before the names of the joints are known
         self._parameters_topic: Any = None
-        self._diagnostics = diagnostics.publish_diagnostics(self, self._reports)
+        diagnostics.publish_diagnostics(self, self._reports)
         try:
             if values['autostart']:
                 self.start()
@@ -233,7 +233,6 @@ class EstimatorNode(ManagedNode):
         if self._channels:
             set_period(self._timer, 1.0 / values['publish_rate'])
         self._publish_parameters()
-        set_period(self._diagnostics, values['diagnostics_period'])
 
     def _reports(self) -> list[Report]:
         state = Report('state')

@@ -17,11 +17,10 @@ from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from fhaosmo_ros.nodes.middleware.node import BaseNode
 from rclpy.clock import Clock, ClockType
-from rclpy.timer import Timer
 
 OK, WARN = DiagnosticStatus.OK, DiagnosticStatus.WARN
 ERROR, STALE = DiagnosticStatus.ERROR, DiagnosticStatus.STALE
-QUIET, BEGIN = 5.0, 5.0
+PERIOD, QUIET, BEGIN = 1.0, 5.0, 5.0
 """Seconds."""
 
 
@@ -57,7 +56,7 @@ def array_of(node: BaseNode, stamp: Time, reports: Iterable[Report]) -> Diagnost
         ]
         message.status.append(DiagnosticStatus(
             level=report.level, name=f'{name}: {report.task}', message=report.text,
-            hardware_id=node.values['hardware_id'], values=values,
+            hardware_id='none', values=values,
         ))  # fmt: skip
     return message
 
@@ -94,16 +93,12 @@ class ReportLog:
                 self._quiet[kind] = now + QUIET
 
 
-def publish_diagnostics(node: BaseNode, reports: Callable[[], Iterable[Report]]) -> Timer:
-    """
-    Publish what `reports` returns each `diagnostics_period` of the host's steady clock.
-
-    Returns the timer; the node changes its period.
-    """
+def publish_diagnostics(node: BaseNode, reports: Callable[[], Iterable[Report]]) -> None:
+    """Publish what `reports` returns, each second of the host's steady clock."""
     publisher = node.create_publisher(DiagnosticArray, '/diagnostics', 10)
 
     def publish() -> None:
         publisher.publish(array_of(node, node.get_clock().now().to_msg(), reports()))
 
     clock = Clock(clock_type=ClockType.STEADY_TIME)
-    return node.create_timer(node.values['diagnostics_period'], publish, clock=clock)
+    node.create_timer(PERIOD, publish, clock=clock)
