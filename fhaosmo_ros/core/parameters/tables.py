@@ -231,8 +231,6 @@ CHANNEL_OUTPUT = (
     Parameter('unknown_input_scale', 1.0,
               'What one unit of d stands for in ~/joint_states (effort) and ~/wrench: the mass '
               'or inertia.', lower=-1e12, upper=1e12),
-    Parameter('unknown_input_unit', '',
-              'Unit of d times unknown_input_scale, such as N m. Shown in diagnostics.'),
     Parameter('output_axis', 'linear.x', 'Axis of ~/wrench and ~/accel that d is written to.',
               choices=('linear.x', 'linear.y', 'linear.z', 'angular.x', 'angular.y', 'angular.z'),
               live=False),

@@ -198,9 +198,6 @@ class Health:
                 'd is followed within [s]': 1.0 / tuning.bandwidth,
                 titled('standard deviation of d', unit): d_error,
             }
-        if limits['unknown_input_unit']:
-            scaled = titled('unknown input, scaled', limits['unknown_input_unit'])
-            report.values[scaled] = d * limits['unknown_input_scale']
         report.find(STALE, 'no usable samples', channel.stale)
         held = f'levels from {levels + 1} on hold: an innovation is above epsilon'
         before, self._closed = self._closed, estimate is not None and levels < observer.levels
