@@ -16,14 +16,14 @@ from fhaosmo_ros.core import Observer, Plant
 from fhaosmo_ros.core.parameters.declaration import Parameters
 from fhaosmo_ros.core.parameters.files import load
 from fhaosmo_ros.core.parameters.tables import OBSERVER_PARAMETERS, PLANT_PARAMETERS
-from fhaosmo_ros.core.simulation.metrics import chatter, high_passed, rms
+from fhaosmo_ros.core.simulation.metrics import chatter, rms
 from fhaosmo_ros.tools.cli.command import shipped
 from fhaosmo_ros.tools.plot import COLOURS, envelope, TRUE_STYLE
 from matplotlib.figure import Figure
 import numpy as np
 from studies import evidence
 from studies.evidence import markdown, Row
-from studies.harness import Found, Results, run_study
+from studies.harness import Floats, Found, Results, run_study
 from studies.plant_and_observer import JointRun, simulate
 
 FREQUENCIES = (1.0, 5.0)
@@ -98,6 +98,21 @@ def simulated(name: str, omega: float) -> JointRun:
     observer = observer.changed({'variant': variant} | own)
     plant = plant.changed({'disturbance_omega': omega})
     return simulate(observer, plant, step, DURATION, max(1, round(GRID / step)))
+
+
+def high_passed(x: Floats, window: int) -> float:
+    """
+    Return the RMS of what a centred moving average leaves: chatter without the signal below it.
+
+    It averages `window` samples of x, (K,), rounded up to an odd number; NaN if K is less.
+    """
+    window |= 1
+    if len(x) < window:
+        return float('nan')
+    total = np.cumsum(np.concatenate([[0.0], x]))
+    mean = (total[window:] - total[:-window]) / window
+    half = window // 2
+    return float(rms(x[half : len(x) - half] - mean))
 
 
 def score(run: JointRun) -> Score:

@@ -12,7 +12,7 @@ REMOVED = {
     'max_step': 'leave it out: intervals of more than twice the mean are bridged',
     'spike_gate_samples': "leave it out: 'spike_gate' rejects five samples in a row at most",
     'chatter_weight': "leave it out: 'tune' counts the errors alone",
-    'warn_chatter_above': 'leave it out: /diagnostics has the chatter of d as a number',
+    'warn_chatter_above': 'leave it out: /diagnostics says nothing of chatter',
     'error_bad_share_above': 'leave it out: ERROR if more than half of the samples were unused',
     'input_reliability': "set 'qos_overrides./TOPIC.subscription.reliability'",
     'input_durability': "set 'qos_overrides./TOPIC.subscription.durability'",

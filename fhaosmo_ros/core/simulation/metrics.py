@@ -22,18 +22,3 @@ def chatter(estimate: Series, truth: Series) -> float:
     """
     variation, reference = (float(np.sum(np.abs(np.diff(x)))) for x in (estimate, truth))
     return variation / reference if reference > 0.0 else float('inf')
-
-
-def high_passed(x: Series, window: int) -> float:
-    """
-    Return the RMS of what a centred moving average leaves: chatter without the signal below it.
-
-    It averages `window` samples of x, (K,), rounded up to an odd number; NaN if K is less.
-    """
-    window |= 1
-    if len(x) < window:
-        return float('nan')
-    total = np.cumsum(np.concatenate([[0.0], x]))
-    mean = (total[window:] - total[:-window]) / window
-    half = window // 2
-    return float(rms(x[half : len(x) - half] - mean))

@@ -134,7 +134,6 @@ class Channel:
             self._arrived, health.latest = True, now
             health.stamps.append(stamp)
             health.stepping += now - begin
-            health.d.append(estimator.observer.estimate.unknown_input)
             if now >= self._due:
                 self._tell_snapshot(Flag(0) if self._due else Flag.STARTED)
             if self.values['publish_on'] == 'sample':

@@ -8,12 +8,9 @@ from time import perf_counter
 from typing import Any
 
 from fhaosmo_ros.core.parameters.units import derivative_unit, titled
-from fhaosmo_ros.core.simulation.metrics import high_passed
 from fhaosmo_ros.nodes.middleware.diagnostics import ERROR, Report, STALE, WARN
 import numpy as np
 
-WINDOW = 5
-"""Samples in the moving average that separates chatter from the signal."""
 NANOSECONDS = 1e-9
 BAD_SHARE = 0.5
 """Share of samples lost or rejected that is an error; any at all deserves a warning."""
@@ -68,13 +65,13 @@ class Health:
     """
     Makes two reports of the samples of a `Channel`.
 
-    It remembers stamp (ns) and d of each sample that was used, as `latest` when the last one came,
+    It remembers the stamp (ns) of each sample that was used, as `latest` when the last one came,
     on `perf_counter`, and as `stepping` how long the steps took in all (s).
     """
 
     def __init__(self, channel: Any) -> None:
         self._channel = channel
-        self.stamps, self.d = array('q'), array('d')
+        self.stamps = array('q')
         self.latest, self.stepping = nan, 0.0
         self._before, self._closed = self._counts(), False
 
@@ -108,7 +105,7 @@ class Health:
         period = float(np.mean(periods)) if len(periods) else nan
         jitter = float(np.std(periods)) / period if period > 0.0 else nan
         reports = [self._input(news, period, jitter), self._observer(news, period)]
-        del self.stamps[:], self.d[:]
+        del self.stamps[:]
         self.stepping = 0.0
         return reports
 
@@ -178,16 +175,13 @@ class Health:
         gamma, d = (estimate.gamma, estimate.unknown_input) if estimate else (nan, nan)
         levels = estimate.open_levels if estimate else 0
         spread = observer.structure.memory['spread']
-        past, step = np.array(self.d), self.stepping / max(1, len(self.d))
-        deviation = float(np.std(past)) if len(past) else nan
-        index = min(1.0, high_passed(past, WINDOW) / deviation) if deviation > 0.0 else 0.0
+        step = self.stepping / max(1, len(self.stamps))
         report = Report(f'{channel.name} observer'.lstrip(), {
             'open levels': f'{levels} of {observer.levels}',
             'gamma': gamma,
             'gamma is held by ~/freeze': estimator.frozen,
             'innovations over those expected': spread,
             titled('unknown input', unit): d,
-            'chatter index (0 smooth, 1 nothing but chatter)': index,
             'step time, mean [us]': 1e6 * step,
         })  # fmt: skip
         if observer.self_tuning:
