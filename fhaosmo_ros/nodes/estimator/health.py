@@ -18,8 +18,6 @@ JITTER = 0.5
 """Standard deviation of the sampling period over its mean that deserves a warning."""
 DELAY = 0.1
 """Seconds between stamp and arrival that deserve one: a slow host, or clocks that differ."""
-GAMMA_AWAY = 0.2
-"""Distance of gamma from where it began that deserves a warning."""
 RATE_RATIO = 1.5
 """Factor between the rate of y and that of the gains that deserves one."""
 SPREAD = 3.0
@@ -202,10 +200,6 @@ class Health:
         report.find(ERROR, again, diverged)
         report.find(WARN, f'y jumped {jumps} times: all estimates but that of z1 go on', jumps)
         report.find(WARN, f'y is taken as {offset:.3g} too large since it jumped', offset)
-        if observer.configuration.adaptive and not observer.self_tuning:
-            away = gamma - observer.parameters['gamma_initial']
-            moved = f'gamma is {away:+.2g} away from gamma_initial'
-            report.find(WARN, moved, abs(away) > GAMMA_AWAY)
         tuned = observer.parameters['correction_period']
         if tuned and period > 0.0 and observer.configuration.levant:
             rates = f'gains are for {1.0 / tuned:.4g} Hz, y comes at {1.0 / period:.4g} Hz'
