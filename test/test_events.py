@@ -56,8 +56,8 @@ RESTART = SPIKES + pulse(500, 501, height=Status.RESTARTED).astype(int)
     # What lasts for less counts from its own begin.
     (pulse(100, 140) + pulse(141, 180) + pulse(200, 300), {}, events_at(250, 300)),
     # Hysteresis keeps an event together.
-    (DENT, {'event_threshold': 0.8, 'event_release': 0.3}, events_at(150, 500)),
-    (DENT, {'event_threshold': 0.8, 'event_release': 1.0}, events_at(150, 200, 260, 500)),
+    (DENT, {'event_threshold': 0.7}, events_at(150, 500)),
+    (DENT, {'event_threshold': 0.9}, events_at(150, 200, 260, 500)),
     # Rejected samples do not count, and a restart ends an event.
     (ONE - pulse(400, 420), {'words': SPIKES}, ONCE),
     (ONE - pulse(400, 420), {'words': RESTART}, events_at(350, 500, 551, 600)),

@@ -71,7 +71,6 @@ CHANGES = {
     'event_threshold': Change(1e-3),
     'event_deviations': Change(0.1, SELF_TUNING | {'event_duration': 0.0}),
     'event_duration': Change(0.0, EVENTS),
-    'event_release': Change(0.1, EVENTS),
     'event_change_time': Change(0.02, EVENTS),
 }
 

@@ -3,7 +3,7 @@
 Events: d, or its change, is larger than it should be for longer than it may.
 
 An event begins where |s| has exceeded the limit L = max(event_threshold, event_deviations sigma)
-for event_duration, and ends where |s| <= event_release L. s is d, or what d lies from its running
+for event_duration, and ends where |s| <= L / 2. s is d, or what d lies from its running
 mean m by (event_change_time T > 0), which begins with the mean of the first T seconds, in which
 nothing is judged:
 
@@ -35,6 +35,8 @@ LONG = 1e9
 """Seconds that max_gap = 0 stands for."""
 GROWTH, QUICKER = 800.0, 4.0
 """The lag of sigma in samples, with tuning_memory = 0; how much quicker while an event lasts."""
+RELEASE = 0.5
+"""An event ends below this part of what it has to exceed (hysteresis)."""
 EARLIEST = -(2**63)
 # What a detector does: it waits for a standard deviation; learns the mean; nothing is beyond the
 # limit; it is, not for long enough yet; an event lasts; the estimates of one were lost.
@@ -129,7 +131,6 @@ class EventDetector:
         self._growth = round(p['tuning_memory'] * SECOND)
         self._max_gap = round((p['max_gap'] or LONG) * SECOND)
         self._threshold, self._deviations = p['event_threshold'], p['event_deviations']
-        self._release = p['event_release']
         self.on = self._threshold > 0.0 or self._deviations > 0.0
         if was_on and not self.on:
             m = self.memory
@@ -215,7 +216,7 @@ class EventDetector:
             m.event_mean -= math.expm1(-elapsed / self._change_time) * signal
         limit = max(self._threshold, self._deviations * m.event_deviation)
         lasts = m.event == ACTIVE
-        if abs(signal) > (self._release * limit if lasts else limit):
+        if abs(signal) > (RELEASE * limit if lasts else limit):
             if m.event == QUIET:
                 m.event, m.event_since, m.event_stamp = BEYOND, now, stamp
             if lasts or now - m.event_since < self._duration:

@@ -21,6 +21,7 @@ REMOVED = {
     'sines': 'leave it out: a sum has 5 sines',
     'search': "leave it out: 'tune' searches the model of d, or the gains where 'lambda' is set",
     'unknown_input_unit': "leave it out: ~/joint_states has d times 'unknown_input_scale'",
+    'event_release': 'leave it out: an event ends below half of what it has to exceed',
     'diagnostics_period': 'leave it out: reports come every second',
     'hardware_id': "leave it out: reports have 'none'",
     'warn_rate_below': 'leave it out: /diagnostics has the sample rate as a number',

@@ -180,9 +180,6 @@ EVENTS = (
     Parameter('event_duration', 0.05,
               'An event begins only after so long without a break: longer means fewer false '
               'alarms, and later ones.', unit='s', lower=0.0, upper=3600.0),
-    Parameter('event_release', 0.5,
-              'An event ends below this part of what it has to exceed (hysteresis).', lower=0.0,
-              upper=1.0),
     Parameter('event_change_time', 0.0,
               '> 0: not |d| is judged, but how far d lies from its running mean over about this '
               'time. For a d that is never 0, such as friction or an error of Phi.', unit='s',
