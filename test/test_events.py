@@ -73,16 +73,16 @@ def test_an_event_lasts_from_the_least_duration_to_the_release(d, own, events):
 
 
 def test_a_standard_deviation_that_grows_with_the_event_does_not_hide_it():
-    d, deviations = pulse(300, 900), np.full(1000, 0.1)
+    deviations = np.full(1000, 0.1)
     deviations[300:] = 1.0
-    # Half of 0.4 * 10^(1 - e^(-4 t)) is 1 after 0.3 s.
-    _, (end, _) = found(d, deviations, event_deviations=4.0, tuning_memory=1.0)
-    assert end == pytest.approx(600, abs=3)
-    # From the end of an event on it counts as it is.
     for height, later in ((3.9, []), (4.1, [(750, True)])):
         d = pulse(300, 600) + pulse(700, 1000, height=height)
-        own = {'event_deviations': 4.0, 'tuning_memory': 100.0}
-        assert found(d, deviations, **own) == ONCE + later
+        begin, (end, _), *others = found(d, deviations, event_deviations=4.0)
+        assert begin == (350, True)
+        # Half of 0.4 * 10^(1 - e^(-k / 200)) is 1 after 240 samples.
+        assert end == pytest.approx(540, abs=3)
+        # From the end of an event on it counts as it is.
+        assert others == later
 
 
 def test_a_change_is_judged_against_the_running_mean():

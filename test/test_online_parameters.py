@@ -37,7 +37,6 @@ EVENTS = {
 CHANGES = {
     'unknown_input_decay': Change(50.0),
     'bandwidth': Change(3.0, SELF_TUNING),
-    'tuning_memory': Change(0.05, SELF_TUNING),
     'variant': Change('sign'),
     'scheme': Change('explicit'),
     'prediction_step': Change(1e-4, PREDICTING),

@@ -12,9 +12,7 @@ nothing is judged:
 sigma is the standard deviation of d. Where that grows, sigma follows with a lag, because what is
 not expected makes a self-tuning observer less sure of d at once, and this must not hide it:
 
-    (log sigma)' = (log deviation - log sigma) / (tuning_memory, a quarter of it while |s| > L)
-
-With tuning_memory = 0 the lag is 800 samples.
+    (log sigma)' = (log deviation - log sigma) / (800 samples, a quarter of it while |s| > L)
 
 Rejected samples do not count. After a restart nothing is known, so an event ends there.
 """
@@ -34,7 +32,7 @@ SECOND = 1_000_000_000
 LONG = 1e9
 """Seconds that max_gap = 0 stands for."""
 GROWTH, QUICKER = 800.0, 4.0
-"""The lag of sigma in samples, with tuning_memory = 0; how much quicker while an event lasts."""
+"""The lag of sigma in samples; how much quicker while an event lasts."""
 RELEASE = 0.5
 """An event ends below this part of what it has to exceed (hysteresis)."""
 EARLIEST = -(2**63)
@@ -94,8 +92,7 @@ class EventDetector:
     ----------
     parameters : mapping
         Values for those of an `OnlineEstimator`; defaults for the rest. Used are those whose names
-        begin with ``event_``, tuning_memory, and max_gap: after a longer time durations begin
-        anew (0: never).
+        begin with ``event_``, and max_gap: after a longer time durations begin anew (0: never).
 
     Attributes
     ----------
@@ -128,7 +125,6 @@ class EventDetector:
             self.reset()
         self._change_time = change_time
         self._duration = round(p['event_duration'] * SECOND)
-        self._growth = round(p['tuning_memory'] * SECOND)
         self._max_gap = round((p['max_gap'] or LONG) * SECOND)
         self._threshold, self._deviations = p['event_threshold'], p['event_deviations']
         self.on = self._threshold > 0.0 or self._deviations > 0.0
@@ -198,7 +194,7 @@ class EventDetector:
         if m.event == LOST:
             m.event = FRESH
             return d, math.inf
-        m.event_deviation = self._sigma(elapsed, deviation)
+        m.event_deviation = self._sigma(deviation)
         if m.event == FRESH:
             m.event_since, m.event_mean = now, d
             if math.isfinite(deviation):
@@ -229,15 +225,14 @@ class EventDetector:
             m.event_deviation = deviation
         return signal, limit
 
-    def _sigma(self, elapsed: int, deviation: float) -> float:
+    def _sigma(self, deviation: float) -> float:
         """Return the standard deviation that events are judged by from now on."""
         sigma = self.memory.event_deviation
         if self.memory.event == FRESH or sigma <= 0.0:
             return deviation
         if deviation > sigma:
-            lag = (self._growth or GROWTH) / (QUICKER if self.memory.event > QUIET else 1.0)
-            share = elapsed if self._growth else 1.0
-            sigma *= math.pow(deviation / sigma, -math.expm1(-share / lag))
+            lag = GROWTH / (QUICKER if self.memory.event > QUIET else 1.0)
+            sigma *= math.pow(deviation / sigma, -math.expm1(-1.0 / lag))
         return min(sigma, deviation)
 
     def taken(self) -> list[Event]:

@@ -48,9 +48,6 @@ OBSERVER = (
     Parameter('bandwidth', 1.0,
               'self_tuning: factor on the bandwidth that it would choose. Higher: quicker and '
               'noisier.', lower=0.1, upper=10.0),
-    Parameter('tuning_memory', 0.0,
-              'self_tuning: how long a sample counts in the choice of the observers. 0: 8000 '
-              'samples.', unit='s', lower=0.0, upper=1e12),
     Parameter('structure', 'cascade',
               "cascade: the paper's levels, each with its own innovation. levant: Levant's "
               'differentiator, every level driven by y - z_hat_1; it needs unknown_input and '

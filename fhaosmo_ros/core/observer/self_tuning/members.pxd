@@ -59,7 +59,6 @@ cdef struct Sample:
     double floor  # the least that the variance of the noise can be
     double largest  # variance of the innovations with which a member can judge it
     double average  # number of samples to average the noise over
-    double kept  # part of the log-likelihoods that is not forgotten
 
 
 cdef struct Work:

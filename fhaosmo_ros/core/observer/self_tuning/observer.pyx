@@ -36,8 +36,7 @@ import numpy as np
 
 cdef enum:
     CACHE_LINE = 64  # bytes; a vector of the processor that crosses two takes twice as long
-# A log-likelihood is remembered for so many samples, unless `tuning_memory` says otherwise.
-cdef double MEMORY = 8000.0
+cdef double MEMORY = 8000.0  # a log-likelihood is remembered for so many samples
 cdef double NOISE_SAMPLES = 1000.0  # the noise is averaged over so many
 # What is beyond 3 sigma in so many samples after a jump of d is due to it, too.
 cdef double JUMP_SAMPLES = 10.0
@@ -78,7 +77,7 @@ cdef class SelfTuning(Structure):
             )
         p = configuration.parameters
         self.is_linear = configuration.model.is_linear
-        self.forgetting, self.slider = p['tuning_memory'], p['bandwidth']
+        self.slider = p['bandwidth']
         self.block = calloc(1, sizeof(Members) + CACHE_LINE)
         if self.block == NULL:
             raise MemoryError
@@ -301,7 +300,6 @@ cdef class SelfTuning(Structure):
         cdef bint same = fabs(h - shared.flow_period) <= EXACT * shared.flow_period
         cdef int i
         sample.h = h
-        sample.kept = exp(-h / self.forgetting if self.forgetting > 0.0 else -1.0 / MEMORY)
         self.carry_flow(h, u, same)
         speed = (self.prediction.z[0] - self.level[0].z_hat) / h
         if not shared.jitter * speed * speed <= LARGEST:  # of a prediction that has overflowed
@@ -453,7 +451,7 @@ cdef class SelfTuning(Structure):
         cdef Members* m = self.members
         cdef Sample* sample = &m.work.sample
         cdef bint quantised = sample.quanta > 0.0
-        cdef double kept = sample.kept
+        cdef double kept = exp(-1.0 / MEMORY)
         follow_noise(m)
         if sample.roughness > HUBER * HUBER and not quantised:
             kept = -1.0  # it does not judge them
