@@ -44,7 +44,6 @@ CHANGES = {
     'noise_size': Change(1e-3, SCHEDULED, reset=True),
     'state_sizes': Change(5.0, SCHEDULED, reset=True),
     'unknown_input_size': Change(9.0, SCHEDULED, reset=True),
-    'unknown_input_rate': Change(9.0, SCHEDULED, reset=True),
     'lambda': Change(500.0),
     'alpha': Change([10.0, 20.0, 30.0, 40.0]),
     'epsilon': Change(1e-4),

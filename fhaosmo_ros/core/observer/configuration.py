@@ -8,7 +8,7 @@ from typing import Any
 from fhaosmo_ros.core.model.phi import Expressions
 from fhaosmo_ros.core.model.triangular import TriangularModel
 from fhaosmo_ros.core.observer.fuzzy import curves, of_level, read_system
-from fhaosmo_ros.core.observer.kalman import LinearModel, Uncertainty
+from fhaosmo_ros.core.observer.kalman import LinearModel, RATE, Uncertainty
 from fhaosmo_ros.core.parameters.declaration import Parameter
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.tables import OBSERVER_PARAMETERS
@@ -133,7 +133,7 @@ class ObserverConfiguration:
         self.expressions = self.model.with_unknown_input(
             p['unknown_input_decay'], p['unknown_input_derivatives']
         )
-        rate = p['unknown_input_decay'] or p['unknown_input_rate']
+        rate = p['unknown_input_decay'] or RATE
         usual = p['unknown_input_size'] / rate ** np.arange(n, 0.0, -1.0)  # d integrated
         self.state_sizes = np.where(self.state_sizes > 0.0, self.state_sizes, usual)
         starts = not self.levant or p['correction_period'] > 0.0

@@ -25,6 +25,7 @@ cdef double MOST_STEPS = 100.0
 # `unknown_input_size`: the start hardly depends on sizes of states that are too large, or on a
 # size of d that is too small, but it does on the opposite.
 STATES_DOUBT, INPUT_DOUBT = 5.0, 0.4
+RATE = 1.0  # how fast d changes where `unknown_input_decay` is 0 (1/s)
 DOUBLINGS = 60
 
 
@@ -192,7 +193,7 @@ class Uncertainty:
         rates = np.eye(levels, k=1)
         rates[:n, :n] += jacobian
         rates[range(n, levels), range(n, levels)] = -decay
-        rate = decay or p['unknown_input_rate']
+        rate = decay or RATE
         self.variance = p['noise_size'] ** 2
         self.linear = LinearModel(rates, size**2 * matern(rate, k))
         self.fresh = np.zeros((levels, levels))
@@ -230,9 +231,9 @@ class Uncertainty:
             steady = h * np.outer(unit, unit)
         if not np.isfinite(steady).all() or not steady[0, 0] > 0.0:
             raise ConfigurationError(
-                "parameters 'noise_size', 'unknown_input_size', 'unknown_input_rate', "
-                "'unknown_input_decay', 'correction_period', 'structure', 'phi': expected values "
-                'for which there is a Kalman filter in floating-point numbers, or noise_size = 0, '
+                "parameters 'noise_size', 'unknown_input_size', 'unknown_input_decay', "
+                "'correction_period', 'structure', 'phi': expected values for which there is a "
+                'Kalman filter in floating-point numbers, or noise_size = 0, '
                 f'got a noise of {noise:g} and an intensity of {self.linear.intensity:g}'
             )
         return steady

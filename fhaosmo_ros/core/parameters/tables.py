@@ -80,9 +80,6 @@ OBSERVER = (
               lengths='1 or n'),
     Parameter('unknown_input_size', 1.0, 'RMS of d in usual operation. Used with noise_size.',
               lower=1e-12, upper=1e12),
-    Parameter('unknown_input_rate', 1.0,
-              'How fast d changes, where unknown_input_decay is 0. Used with noise_size.',
-              unit='1/s', lower=1e-6, upper=1e6),
     Parameter('lambda', [1.4, 7.2, 6.4, 2.0],
               'Gains lambda_i of the injection |eps_i|^gamma psi_i(eps_i); levant: |eps_1|^(2 '
               'gamma (N - i) / N) psi_i(eps_1). Higher: quicker and noisier.', lower=0.0,
