@@ -64,11 +64,11 @@ SETS: dict[str, tuple[dict[str, Any], ...]] = {
     GOOD: (
         {'variant': 'sign'}, {'variant': 'fuzzy'}, {'scheme': 'explicit', 'variant': 'fuzzy'},
         {'lambda': [15.0], 'alpha': [30.0]}, {'epsilon': 0.5}, {'publish_rate': 250.0},
-        {'estimate_from': 'filtered'}, {'gamma_rate': 4.0, 'gamma_min': 0.4, 'gamma_max': 0.6},
+        {'estimate_from': 'filtered'}, {'gamma_rate': 4.0, 'gamma_min': 0.4},
     ),
     BAD: (
         {'variant': 'fuzy'}, {'lambda': [-1.0]}, {'alpha': [1.0, 2.0]}, {'epsilon': math.nan},
-        {'gamma_min': 0.9, 'gamma_max': 0.2}, {'order': 7}, {'no_such_parameter': 1.0},
+        {'gamma_min': 0.9, 'gamma_initial': 0.2}, {'order': 7}, {'no_such_parameter': 1.0},
     ),
 }  # fmt: skip
 SETS[BASE] = ({name: PARAMETERS[name] for changes in SETS[GOOD] for name in changes},)

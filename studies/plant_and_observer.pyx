@@ -117,8 +117,7 @@ cdef class Joint(Dynamics):
                 for _ in range(every if row > 0 else 0):
                     take_step(self, &BOGACKI_SHAMPINE, step * h, h, <double*>&self.state)
                     if law.adaptive:  # D 8
-                        self.state.gamma = fmin(fmax(self.state.gamma, law.gamma_min),
-                                                law.gamma_max)
+                        self.state.gamma = fmin(fmax(self.state.gamma, law.gamma_min), 1.0)
                     step += 1
                 for i in range(n):
                     z[row, i] = self.state.z[i]

@@ -12,7 +12,7 @@ from scipy.signal import lfilter
 # Every number that a test relies on; the defaults may change.
 SMALL = {'order': 2, 'phi': ['0', '-z2*z2*z1 + u'], 'lambda': 3.0, 'alpha': 4.0}
 SMALL |= {'epsilon': 0.025, 'fuzzy_widths': [0.02], 'unknown_input': True}
-SMALL |= {'gamma_initial': 0.5, 'gamma_min': 0.3, 'gamma_max': 0.8, 'gamma_rate': 0.004}
+SMALL |= {'gamma_initial': 0.5, 'gamma_min': 0.3, 'gamma_rate': 0.004}
 SMALL |= {'gamma_dead_zone': 0.0, 'gamma_leakage': 0.0, 'start_from_measurement': True}
 VARIANTS = ('sign', 'fuzzy', 'fuzzy_adaptive', 'sign_adaptive')
 FORMS = (('cascade', 'explicit'), ('cascade', 'implicit'), ('levant', 'predict_correct'))

@@ -158,7 +158,7 @@ class Cascade(Reference):
             gamma -= h * p['gamma_leakage'] * (gamma - p['gamma_initial'])
         if not rests:
             gamma -= h * p['gamma_rate'] * slope(loss)
-        self.gamma = min(max(gamma, p['gamma_min']), p['gamma_max'])
+        self.gamma = min(max(gamma, p['gamma_min']), 1.0)
 
     def open(self):
         m = [self.y, *(v.real for v in self.tilde[: self.N - 1])]
@@ -229,7 +229,7 @@ def parameters(n, extra, **others):
         'epsilon': 0.2, 'fuzzy_widths': [0.05, 0.3][:levels],
         'fuzzy_systems': ['terms 5', 'terms 7'], 'gamma_initial': 0.5,
         'gamma_rate': 0.5,  # fast, so that gamma matters within the horizon
-        'gamma_min': 0.2, 'gamma_max': 0.9, 'gamma_dead_zone': 0.0, 'gamma_leakage': 0.0,
+        'gamma_min': 0.2, 'gamma_dead_zone': 0.0, 'gamma_leakage': 0.0,
         'initial_estimate': list(rng.uniform(-0.2, 0.2, levels)),
         'initial_internal': list(rng.uniform(-0.2, 0.2, levels)),
         'start_from_measurement': False,
@@ -281,7 +281,8 @@ def test_cascade_follows_the_equations(scheme, variant, n, extra):
     {'gamma_rate': 0.0, 'gamma_initial': 0.7},
     {'gamma_leakage': 2.0},
     {'gamma_dead_zone': 0.1, 'gamma_leakage': 3.0},
-    {'gamma_min': 0.499, 'gamma_max': 0.501},
+    {'gamma_min': 0.499},
+    {'gamma_initial': 0.999},
     {'gamma_rate': 0.0, 'gamma_leakage': 5.0, 'gamma_initial': 0.31, 'gamma_min': 0.3},
     {'fuzzy_systems': ['terms gaussian 5', 'terms trapezoid 7']},
     {'start_from_measurement': True, 'fuzzy_widths': [0.02]},

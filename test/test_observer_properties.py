@@ -33,7 +33,8 @@ def test_split_run_and_steps_equal_a_whole_run_and_a_reset_forgets_it(law, a, b)
 
 def test_snapshot_of_another_variant_gives_a_power_that_fits():
     adaptive = Observer(SMALL | {'variant': 'fuzzy_adaptive', 'gamma_initial': 0.7})
-    for other, power in ({'variant': 'sign'}, 0.5), ({'gamma_max': 0.6}, 0.6):
+    bound = {'gamma_initial': 0.9, 'gamma_min': 0.8}
+    for other, power in ({'variant': 'sign'}, 0.5), (bound, 0.8):
         observer = Observer(SMALL | {'variant': 'fuzzy_adaptive'} | other)
         observer.structure.load_state_dict(state_of(adaptive))
         assert state_of(observer)['gamma'] == power

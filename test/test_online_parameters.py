@@ -52,7 +52,6 @@ CHANGES = {
     'gamma_initial': Change(0.9, {'gamma_leakage': 5.0, 'gamma_dead_zone': 0.0}),
     'gamma_rate': Change(0.5),
     'gamma_min': Change(0.6, {'gamma_initial': 0.2}, {'gamma_initial': 0.67}),
-    'gamma_max': Change(0.7, {'gamma_initial': 0.9}, {'gamma_initial': 0.67}),
     'gamma_dead_zone': Change(1e6),
     'gamma_leakage': Change(5.0, {'gamma_dead_zone': 0.0}, {'gamma_initial': 0.9}),
     'initial_estimate': Change(SEED, reset=True),

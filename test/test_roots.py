@@ -20,9 +20,9 @@ def test_gamma_stays_within_its_bounds_which_are_flagged(scheme, rate, leakage, 
     observer.start(0.0)
     for y in np.random.default_rng(seed).uniform(-1.0, 1.0, 50):
         estimate = observer.step(y, dt, 0.0)
-        assert 0.3 <= estimate.gamma <= 0.8
+        assert 0.3 <= estimate.gamma <= 1.0
         assert bool(estimate.status & Status.GAMMA_AT_MIN) == (estimate.gamma == 0.3)
-        assert bool(estimate.status & Status.GAMMA_AT_MAX) == (estimate.gamma == 0.8)
+        assert bool(estimate.status & Status.GAMMA_AT_MAX) == (estimate.gamma == 1.0)
 
 
 @given(st.floats(0.0, 1e3), st.floats(1e-5, 10.0))
@@ -44,7 +44,7 @@ def law(variant, lambda_, alpha, width, system='terms 5', gamma=0.5):
     return Observer({
         'order': 1, 'phi': ['0'], 'unknown_input': False, 'variant': variant, 'lambda': lambda_,
         'alpha': alpha, 'fuzzy_widths': width, 'fuzzy_systems': [system],
-        'gamma_initial': gamma, 'gamma_min': gamma, 'gamma_max': 1.0, 'gamma_rate': 0.0,
+        'gamma_initial': gamma, 'gamma_min': gamma, 'gamma_rate': 0.0,
     })  # fmt: skip
 
 
@@ -116,7 +116,7 @@ def test_root_of_next_to_nothing(variant, b):
 )  # fmt: skip
 def test_root_of_levants_structure(variant, b, h, gamma, lambdas, width):
     p = {'structure': 'levant', 'variant': variant, 'lambda': lambdas, 'fuzzy_widths': width}
-    p |= {'phi': ['0'] * 3, 'gamma_initial': gamma, 'gamma_min': gamma, 'gamma_max': 1.0}
+    p |= {'phi': ['0'] * 3, 'gamma_initial': gamma, 'gamma_min': gamma}
     levant = Observer(p)
     levant.start(-b)
     estimate = levant.step(0.0, h)

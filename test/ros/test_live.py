@@ -147,7 +147,7 @@ def test_common_parameter_serves_channels_without_their_own(user, rigs):
         assert of_channel(values, channel)['epsilon'] == epsilon
         assert parameters.get(f'{channel}.epsilon') == epsilon
     # What one channel cannot take is refused for all.
-    changes = {'hip.gamma_max': 0.8, 'gamma_initial': 0.9}
+    changes = {'hip.gamma_min': 0.8, 'gamma_initial': 0.7}
     before = parameters.all([*changes, 'knee.gamma_initial'])
     assert "channel 'hip': parameter" in parameters.try_to_set(**changes).reason
     assert parameters.all(before) == before

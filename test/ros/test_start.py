@@ -116,13 +116,13 @@ def test_files_and_rules_reach_the_node_for_which_they_are(user, launch, tmp_pat
         '/rig/lead: {ros__parameters: {alpha: [7], spike_gate: 0.5}}\n'
     )
     files = in_files(['--params-file', text, '--params-file', OF_PLANT], tmp_path)
-    own = ['lambda:=[12.0, 13.0, 14.0]', 'gamma_max:=0.97', 'plant:noise:=0.1']
+    own = ['lambda:=[12.0, 13.0, 14.0]', 'gamma_min:=0.07', 'plant:noise:=0.1']
     own.append('qos_overrides./rig/y.subscription.reliability:=reliable')
     process = launch('estimator', '-r', '__node:=lead', '-r', '__ns:=/rig', *files, *rules(*own))
     parameters = Parameters(user, '/rig/lead')
     expected = {
         'order': 2, 'phi': ['0', '-z2'], 'lambda': [12.0, 13.0, 14.0], 'max_gap': 2.0,
-        'alpha': [7.0], 'spike_gate': 0.5, 'gamma_max': 0.97,
+        'alpha': [7.0], 'spike_gate': 0.5, 'gamma_min': 0.07,
         'qos_overrides./rig/y.subscription.depth': 7,
         'qos_overrides./rig/y.subscription.reliability': 'reliable',
         'epsilon': ESTIMATOR_PARAMETERS['epsilon'].default,

@@ -63,10 +63,10 @@ class ObserverConfiguration:
     def __init__(self, parameters: Mapping[str, Any]) -> None:
         p = self.parameters = OBSERVER_PARAMETERS.complete(parameters)
         self.model = TriangularModel.of(p)
-        if not p['gamma_min'] <= p['gamma_initial'] <= p['gamma_max']:
+        if not p['gamma_min'] <= p['gamma_initial']:
             raise ConfigurationError(
-                "parameters 'gamma_min', 'gamma_initial', 'gamma_max': expected each at most the "
-                f'next one, got {p["gamma_min"]}, {p["gamma_initial"]}, {p["gamma_max"]}'
+                "parameters 'gamma_min', 'gamma_initial': expected the first at most the second, "
+                f'got {p["gamma_min"]}, {p["gamma_initial"]}'
             )
         self.self_tuning = p['gains'] == 'self_tuning'
         self.schedule = None

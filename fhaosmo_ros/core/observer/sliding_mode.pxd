@@ -36,7 +36,7 @@ cdef class SlidingMode(Structure):
     cdef const double* curves  # its numbers
     cdef int knots
     cdef Level first[MOST_LEVELS]  # levels of a fresh observer
-    cdef double gamma_initial, gamma_rate, gamma_min, gamma_max  # law of gamma (D 7)
+    cdef double gamma_initial, gamma_rate, gamma_min  # law of gamma (D 7)
     cdef double dead_zone  # no adaptation while sqrt(L) is smaller (D 8, unit of y)
     cdef double leakage  # of gamma, towards gamma_initial (1/s)
     # For scheduled gains (D 20).

@@ -81,7 +81,7 @@ cdef class SlidingMode(Structure):
         self.table = configuration.curves
         self.curves, self.knots = &self.table[0, 0], configuration.curves.shape[1]
         self.gamma_initial, self.gamma_rate = configuration.gamma_initial, p['gamma_rate']
-        self.gamma_min, self.gamma_max = p['gamma_min'], p['gamma_max']
+        self.gamma_min = p['gamma_min']
         self.dead_zone, self.leakage = p['gamma_dead_zone'], p['gamma_leakage']
         schedule = configuration.schedule
         self.scheduled = schedule is not None
@@ -105,7 +105,7 @@ cdef class SlidingMode(Structure):
         cdef int i
         Structure.load_state_dict(self, values)
         if self.adaptive:
-            self.memory.gamma = min(max(self.memory.gamma, self.gamma_min), self.gamma_max)
+            self.memory.gamma = min(max(self.memory.gamma, self.gamma_min), 1.0)
         else:
             self.memory.gamma = self.gamma_initial
         if not self.sensitive:
@@ -134,7 +134,7 @@ cdef class SlidingMode(Structure):
         """
         Change gamma (P adaptationlawgamma); return status flags.
 
-        Projection on [gamma_min, gamma_max], dead zone and leakage are ours (D 8).
+        Projection on [gamma_min, 1], dead zone and leakage are ours (D 8).
         """
         cdef int word = 0, i
         cdef double gamma = self.memory.gamma
@@ -154,8 +154,8 @@ cdef class SlidingMode(Structure):
         if not gamma > self.gamma_min:  # also for NaN, from an infinite gradient step
             gamma = self.gamma_min
             word |= GAMMA_AT_MIN
-        elif gamma >= self.gamma_max:
-            gamma = self.gamma_max
+        elif gamma >= 1.0:
+            gamma = 1.0
             word |= GAMMA_AT_MAX
         self.memory.gamma = gamma
         return word

@@ -104,9 +104,8 @@ OBSERVER = (
     Parameter('gamma_rate', 0.004,
               "Learning rate Gamma of gamma' = -Gamma dL/dgamma; 0 holds gamma.", lower=0.0,
               upper=1e6),
-    Parameter('gamma_min', 0.1, 'Lower bound of gamma, not above gamma_max.', lower=0.0,
+    Parameter('gamma_min', 0.1, 'Lower bound of gamma; the upper one is 1.', lower=0.0,
               lower_open=True, upper=1.0),
-    Parameter('gamma_max', 1.0, 'Upper bound of gamma.', lower=0.0, lower_open=True, upper=1.0),
     Parameter('gamma_dead_zone', 0.2,
               'Adaptation rests while the norm of the innovations is at most this (their unit). '
               'Set it below the norm at which the estimate is good enough. 0: it never rests.',

@@ -209,7 +209,7 @@ class Tuner:
             **SCHEME,
             'correction_period': self._period,
             'unknown_input_size': sizes[-1],
-            'gamma_initial': min(max(GAMMA, own.get('gamma_min', 0.0)), own.get('gamma_max', 1.0)),
+            'gamma_initial': max(GAMMA, own.get('gamma_min', 0.0)),
         }
         if noise <= least:
             # The largest innovations are those of the start: what z_2 moves y by in a period.
@@ -277,7 +277,7 @@ def _dimensions(name: str, observer: Observer) -> Iterator[Dimension]:
         low = max(middle / 10.0**DECADES, declared.lower or 0.0)
         high = min(middle * 10.0**DECADES, declared.upper or 1.0)
         if name == 'gamma_initial':
-            low, high = start['gamma_min'], start['gamma_max']
+            low, high = start['gamma_min'], 1.0
         log = 0.0 < 10.0 * low < high
         begin = min(max(middle if log else value, low), high)
         yield Dimension(label, low, high, begin, log)
