@@ -36,7 +36,6 @@ EVENTS = {
 }  # fmt: skip
 CHANGES = {
     'unknown_input_decay': Change(50.0),
-    'bandwidth': Change(3.0, SELF_TUNING),
     'variant': Change('sign'),
     'scheme': Change('explicit'),
     'prediction_step': Change(1e-4, PREDICTING),

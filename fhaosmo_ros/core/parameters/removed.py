@@ -25,6 +25,7 @@ REMOVED = {
     'tuning_memory': 'leave it out: a sample counts for 8000 samples',
     'unknown_input_rate': "leave it out: it is 1/s; for a quicker d raise 'unknown_input_size'",
     'gamma_max': 'leave it out: it is 1',
+    'bandwidth': "leave it out: 'self_tuning' finds its bandwidth",
     'diagnostics_period': 'leave it out: reports come every second',
     'hardware_id': "leave it out: reports have 'none'",
     'warn_rate_below': 'leave it out: /diagnostics has the sample rate as a number',

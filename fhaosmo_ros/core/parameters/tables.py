@@ -45,9 +45,6 @@ OBSERVER = (
               'size and speed of d are found and followed (docs/self_tuning.md). Of the '
               'parameters from structure to gamma_leakage it uses prediction_step alone.',
               choices=('fixed', 'self_tuning'), live=False),
-    Parameter('bandwidth', 1.0,
-              'self_tuning: factor on the bandwidth that it would choose. Higher: quicker and '
-              'noisier.', lower=0.1, upper=10.0),
     Parameter('structure', 'cascade',
               "cascade: the paper's levels, each with its own innovation. levant: Levant's "
               'differentiator, every level driven by y - z_hat_1; it needs unknown_input and '

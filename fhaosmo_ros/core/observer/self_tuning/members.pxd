@@ -156,7 +156,6 @@ cdef struct Members:
 
 cdef Grid GRID
 cdef double DECAY  # kappa / omega
-cdef double BAND_STEP  # omega of a band over that of the next slower one
 
 cdef inline int pair(int i, int j) noexcept nogil:
     """Return the place of the covariance of z_i and z_j."""

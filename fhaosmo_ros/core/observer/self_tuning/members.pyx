@@ -20,6 +20,7 @@ import numpy as np
 SLOWEST, QUICKEST = 6e-4, 3.0  # range of the bandwidths (rad a sample)
 DERIVATIVES = [0, 1, ORDERS - 1]  # k of the members of each bandwidth
 cdef double DECAY = 0.1
+cdef double BAND_STEP  # omega of a band over that of the next slower one
 CORRELATIONS = [0.0, 0.75, 0.92, 0.98]  # a of the colours of the noise
 COLOURED = [1, 3, 1, 2]  # of the members of four bandwidths in turn
 cdef enum:

@@ -10,7 +10,6 @@ from fhaosmo_ros.core.observer.structure cimport Structure
 cdef class SelfTuning(Structure):
     # What the parameters say.
     cdef bint is_linear  # the model
-    cdef double slider  # estimates are those of members so much quicker
     # What it remembers.
     cdef void* block  # of memory, which holds the members
     cdef Members* members

@@ -75,9 +75,7 @@ cdef class SelfTuning(Structure):
             raise ConfigurationError(
                 f"parameter 'order': expected at most {MOST_ORDER}, got {self.order}"
             )
-        p = configuration.parameters
         self.is_linear = configuration.model.is_linear
-        self.slider = p['bandwidth']
         self.block = calloc(1, sizeof(Members) + CACHE_LINE)
         if self.block == NULL:
             raise MemoryError
@@ -280,10 +278,10 @@ cdef class SelfTuning(Structure):
             follow_jump(m, since_jump)
             self.y_jumped = True
             weigh(m)
-        mix(m, self.slider, mean, self.trial_variances)
+        mix(m, mean, self.trial_variances)
         for i in range(self.levels):
             self.level[i].z_hat = mean[i]
-        tell_model(m, self.slider, jumped, &self.trial_model)
+        tell_model(m, jumped, &self.trial_model)
         for i in range(shared.active):
             if m.far[i] > LOST_SAMPLES:  # far off for long
                 m.far[i] = 0.0

@@ -17,5 +17,5 @@ cdef double FLOOR
 
 cdef VECTORISED judge(Members* m, double grown, double kept) noexcept nogil
 cdef VECTORISED weigh(Members* m) noexcept nogil
-cdef VECTORISED mix(Members* m, double slider, double* mean, double* variances) noexcept nogil
-cdef void tell_model(Members* m, double slider, bint jumped, Model* model) noexcept nogil
+cdef VECTORISED mix(Members* m, double* mean, double* variances) noexcept nogil
+cdef void tell_model(Members* m, bint jumped, Model* model) noexcept nogil

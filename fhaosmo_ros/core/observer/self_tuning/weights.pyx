@@ -1,12 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """How likely each member is, and the mean of all (D 28)."""
 
-from libc.math cimport M_PI, NAN, cos, exp, floor as floor_of, fmin, isfinite, log, pow, sqrt
+from libc.math cimport M_PI, NAN, cos, exp, fmin, isfinite, log, pow, sqrt
 
 from fhaosmo_ros.core.observer.self_tuning.filters cimport HUBER
 from fhaosmo_ros.core.observer.self_tuning.members cimport (
-    BANDS, BAND_STEP, COLOURS, COUNT, FIRST_SAMPLES, GRID, HALF, IN_BAND, Members, ORDERS, Shared,
-    Work, entry, fill, largest, power
+    COLOURS, FIRST_SAMPLES, GRID, Members, ORDERS, Shared, Work, entry, fill, largest, power
 )
 from fhaosmo_ros.core.observer.self_tuning.noise cimport FADED
 from fhaosmo_ros.core.vectors cimport VECTORISED
@@ -70,7 +69,7 @@ cdef VECTORISED weigh(Members* m) noexcept nogil:
         m.weight[g] *= 1.0 / total
 
 
-cdef void tell_model(Members* m, double slider, bint jumped, Model* model) noexcept nogil:
+cdef void tell_model(Members* m, bint jumped, Model* model) noexcept nogil:
     """
     Write the model of d and the noise of the likeliest member, for a smoother (D 34).
 
@@ -85,27 +84,13 @@ cdef void tell_model(Members* m, double slider, bint jumped, Model* model) noexc
     g = shared.told
     k, noise, a = GRID.order[g], m.work.now[GRID.colour[g]], m.correlation[g]
     twice = 2.0 * (m.n + 1 + k)
-    model.drive, model.loss = m.drive[k][g] * pow(slider, twice), m.kappa[g] * slider
+    model.drive, model.loss = m.drive[k][g], m.kappa[g]
     edge = fmin(pow(model.drive / noise * power(h, 2 * (m.n + 1 + k) - 1), 1.0 / twice), M_PI)
     model.noise = noise / (1.0 + a * (a - 2.0 * cos(edge)))
     model.derivatives = k - ORDERS if jumped else k
 
 
-cdef void shift(const double* weight, double slider, double* shown) noexcept nogil:
-    """Write the weights of the members whose estimates are shown: `slider` bands quicker."""
-    cdef int whole = <int>floor_of(slider), g, j, band, quicker
-    cdef double part = slider - whole
-    for g in range(COUNT):
-        shown[g] = 0.0
-    for g in range(COUNT):
-        band, quicker = GRID.band[g], -IN_BAND if g < HALF else IN_BAND
-        for j in range(2):
-            shown[g + (min(max(band + whole + j, 0), BANDS - 1) - band) * quicker] += (
-                weight[g] * (part if j else 1.0 - part)
-            )
-
-
-cdef VECTORISED mix(Members* m, double slider, double* mean, double* variances) noexcept nogil:
+cdef VECTORISED mix(Members* m, double* mean, double* variances) noexcept nogil:
     """
     Write the mean of the members' estimates of z, d, d', .., and its variances (D 28).
 
@@ -117,13 +102,9 @@ cdef VECTORISED mix(Members* m, double slider, double* mean, double* variances) 
     cdef Work* w = &m.work
     cdef int n = m.n, i
     cdef Py_ssize_t g, active = m.shared.active
-    cdef double* weight = &m.weight[0]
     cdef double* z
     cdef double* p
     cdef double c, total, off, lost = 0.0
-    if slider != 1.0:
-        weight = &w.two[0]
-        shift(m.weight, log(slider) / log(BAND_STEP), weight)
     for g in range(active):
         c = m.kappa[g]
         w.d[0][g] = m.x.d[0][g]
@@ -137,13 +118,13 @@ cdef VECTORISED mix(Members* m, double slider, double* mean, double* variances) 
         z = &m.x.z[i][0] if i < n else &w.d[i - n][0]
         p, total = entry(&m.p, n, i, i), 0.0
         for g in range(active):  # a member without weight may be anywhere
-            total += weight[g] * z[g] if weight[g] > 0.0 else 0.0
+            total += m.weight[g] * z[g] if m.weight[g] > 0.0 else 0.0
         mean[i], total = total, 0.0
         if i <= n:
             for g in range(active):
                 off = z[g] - mean[i]
                 off = (p[g] if p[g] > 0.0 else 0.0) + off * off
-                total += weight[g] * off if weight[g] > 0.0 else 0.0
+                total += m.weight[g] * off if m.weight[g] > 0.0 else 0.0
         variances[i] = total
     total = m.shared.size_of_d + (
         mean[n] * mean[n] + fmin(variances[n], m.shared.size_of_d) - m.shared.size_of_d
@@ -153,8 +134,8 @@ cdef VECTORISED mix(Members* m, double slider, double* mean, double* variances) 
         c, total = HUBER * HUBER * total, 0.0
         z, p = &w.d[0][0], &m.p.dd[0][0][0]
         for g in range(active):
-            off = weight[g] * z[g] * (c / (c + (p[g] if p[g] > 0.0 else 0.0)))
-            total += off if weight[g] > 0.0 else 0.0
+            off = m.weight[g] * z[g] * (c / (c + (p[g] if p[g] > 0.0 else 0.0)))
+            total += off if m.weight[g] > 0.0 else 0.0
         mean[n] = total
     if not isfinite(lost):
         mean[0] = NAN
