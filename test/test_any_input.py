@@ -59,7 +59,7 @@ event = st.one_of(
     *[st.tuples(st.just('y'), stamps, samples)] * 2,
     st.tuples(st.just('set'), st.integers(0, 2**32 - 1), st.sampled_from([0.0, 0.0, 0.3])),
     st.tuples(st.just('u'), samples, st.none()),
-    st.tuples(st.just('do'), st.sampled_from(['reset', 'freeze', 'thaw', 'forget']), st.none()),
+    st.tuples(st.just('do'), st.sampled_from(['reset', 'forget']), st.none()),
 )
 
 
@@ -80,8 +80,6 @@ def test_nothing_raises_and_everything_shown_is_finite(events, seed):
             try_to_configure(estimator, changes(np.random.default_rng(first), second))
         elif kind == 'u':
             estimator.set_input(first)
-        elif first in ('freeze', 'thaw'):
-            estimator.freeze(first == 'freeze')
         elif first == 'reset':
             estimator.reset()
         else:

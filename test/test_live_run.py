@@ -54,10 +54,6 @@ class Live:
         self._tell(Flag.RESET, 150_000)
         self._begins = True
 
-    def freeze(self, held):
-        self.estimator.freeze(held)
-        self._tell(Flag.CHANGED, 150_000)
-
     def change(self, stamp, name, value):
         self.estimator.configure({name: value})
         types, kinds = files.TYPES.types, ('byte', 'bool', 'integer', 'double')
@@ -116,11 +112,13 @@ def test_every_live_estimate_comes_again(begin, tmp_path, capsys):
     live.run(2000, 2300)
     live.change(STAMPS[2299], 'gamma_rate', 0.02)
     live.change(STAMPS[2299], 'epsilon', 2.0)
-    live.run(2300, 2700).freeze(True)
+    live.run(2300, 2700)
+    live.change(STAMPS[2699], 'gamma_rate', 0.0)
     live.run(2700, 3000)
     live.estimator.set_input(-0.4)
     live.messages += files.floats(STAMPS[3000:3001] - 1, np.array([-0.4]), '/rig/u')
-    live.run(3000, 3400).freeze(False)
+    live.run(3000, 3400)
+    live.change(STAMPS[3399], 'gamma_rate', 0.02)
     live.run(3400, COUNT)
     # The publisher's latest message, which a late recorder gets first.
     changed = {'gamma_rate': 0.02, 'epsilon': 2.0} if begin == 2600 else {}

@@ -150,7 +150,7 @@ class OnlineEstimator:
         return float(self._parameters['max_gap'] or max(SILENCE, SILENT_SAMPLES * self.period))
 
     def reset(self) -> None:
-        """Start afresh: the next sample is the first. Counters go on, and so does `freeze`."""
+        """Start afresh: the next sample is the first. Counters go on."""
         with self.policy:
             self.policy.reset()
             self.events.reset()
@@ -223,15 +223,6 @@ class OnlineEstimator:
             self.events.memory = Progress(**events)
             if self.smoothing is not None:
                 self.smoothing.cut()
-
-    def freeze(self, held: bool) -> None:
-        """Hold gamma where it is, or let it adapt again; no parameter changes."""
-        self.policy.change(frozen=held)
-
-    @property
-    def frozen(self) -> bool:
-        """True while gamma is held."""
-        return bool(self.policy.course['frozen'])
 
     @property
     def inputs(self) -> tuple[float, ...]:

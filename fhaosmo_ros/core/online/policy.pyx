@@ -118,7 +118,6 @@ class Counters(namedtuple('Counters', COUNTERS)):
 
 cdef struct Course:
     # Where the estimator is in the course of the samples.
-    bint frozen  # gamma is held
     bint valid  # there is an estimate, of the time `stamp`
     bint timed  # False: the next sample's stamp is of another clock
     bint held  # a sample far away waits for the next one's word
@@ -437,12 +436,9 @@ cdef class Policy:
         self.sensor.changed = self.sensor.seen = now
 
     cdef void refresh(self) noexcept nogil:
-        """Make a fresh observer, whose next sample is the first; a frozen gamma stays."""
+        """Make a fresh observer, whose next sample is the first."""
         cdef Course* course = &self.course
-        cdef double gamma = self.structure.memory.gamma
         self.structure.reset()
-        if course.frozen:
-            self.structure.memory.gamma = gamma
         course.held = course.lost = False
         course.spikes = course.intervals = 0
         course.mean_interval = 0.0
@@ -501,7 +497,7 @@ cdef class Policy:
         """
         cdef Memory* memory = &self.structure.memory
         cdef double mean = self.course.mean_interval, corrected = y - memory.offset
-        cdef double gamma = memory.gamma, bend = 0.0, h, end, sample
+        cdef double bend = 0.0, h, end, sample
         cdef int count = 1, word = 0, k
         cdef bint modelled = True, is_gap = elapsed > GAP_RATIO * mean
         if self.course.intervals < WINDOW or memory.beyond > 0.0:  # after rejected samples
@@ -530,8 +526,6 @@ cdef class Policy:
             word = word & FLAGS_MASK | self.structure.step(sample, h, self.acting)
             if word & REJECTED:
                 break
-            if self.course.frozen:
-                memory.gamma = gamma
         if word & REJECTED_SPIKE:  # as if it had not come: the next one is stepped to instead
             memory.pending = 0.0
             return word

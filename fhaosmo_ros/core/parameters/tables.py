@@ -99,8 +99,8 @@ OBSERVER = (
     Parameter('gamma_initial', 0.95, 'Power gamma at the start of an adaptive variant.', lower=0.0,
               lower_open=True, upper=1.0),
     Parameter('gamma_rate', 0.004,
-              "Learning rate Gamma of gamma' = -Gamma dL/dgamma; 0 holds gamma.", lower=0.0,
-              upper=1e6),
+              "Learning rate Gamma of gamma' = -Gamma dL/dgamma. With 0, and gamma_leakage = 0, "
+              'gamma is held.', lower=0.0, upper=1e6),
     Parameter('gamma_min', 0.1, 'Lower bound of gamma; the upper one is 1.', lower=0.0,
               lower_open=True, upper=1.0),
     Parameter('gamma_dead_zone', 0.2,

@@ -22,7 +22,6 @@ from fhaosmo_ros.nodes.middleware.endpoints import create_publisher, LATCHED, Li
 from fhaosmo_ros.nodes.middleware.messages import labelled, message_class, time_message
 from fhaosmo_ros.topics import estimates_of, EVENT, SNAPSHOT
 from std_msgs.msg import Float64MultiArray
-from std_srvs.srv import SetBool, Trigger
 
 PERIOD, PERIOD_OF_SELF_TUNING = 1.0, 30.0
 """Seconds between two snapshots; a self-tuning estimator remembers hundreds of numbers."""
@@ -187,14 +186,7 @@ class Channel:
         report.find(level, text)
         self._events.publish(array_of(self._node, time_message(stamp), [report]))
 
-    def reset(self, _: Trigger.Request | None = None) -> str:
-        """Start the observer afresh with the next sample; return what has been done."""
+    def reset(self) -> None:
+        """Start the observer afresh with the next sample."""
         self.estimator.reset()
         self._tell_snapshot(Flag.RESET)
-        return 'the observer starts afresh with the next sample'
-
-    def freeze(self, request: SetBool.Request) -> str:
-        """Hold gamma, or let it adapt again; return what has been done."""
-        self.estimator.freeze(request.data)
-        self._tell_snapshot(Flag.CHANGED)
-        return 'gamma is held' if request.data else 'gamma adapts again'

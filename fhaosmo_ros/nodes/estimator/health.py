@@ -177,7 +177,6 @@ class Health:
         report = Report(f'{channel.name} observer'.lstrip(), {
             'open levels': f'{levels} of {observer.levels}',
             'gamma': gamma,
-            'gamma is held by ~/freeze': estimator.frozen,
             'innovations over those expected': spread,
             titled('unknown input', unit): d,
             'step time, mean [us]': 1e6 * step,

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The estimator node: a managed node (ROS 2 lifecycle) of one channel or many."""
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from functools import partial
 from typing import Any
@@ -25,7 +25,7 @@ from fhaosmo_ros.topics import estimates_of, EVENT, PARAMETERS, STANDARD_DEVIATI
 from rclpy.parameter import Parameter as RosParameter
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_msgs.msg import String
-from std_srvs.srv import SetBool, Trigger
+from std_srvs.srv import Trigger
 
 
 class EstimatorNode(ManagedNode):
@@ -116,9 +116,7 @@ class EstimatorNode(ManagedNode):
         self.sources.after_message = self.typed.publish
         by_prefix = {channel.prefix: [channel] for channel in channels}
         for prefix, those in {**by_prefix, '~/': channels}.items():
-            for kind, act in ((Trigger, Channel.reset), (SetBool, Channel.freeze)):
-                answer = partial(self._answer, those, act)
-                self.create_service(kind, prefix + act.__name__, answer)
+            self.create_service(Trigger, f'{prefix}reset', partial(self._reset, those))
         self._channels = channels
         self.sources.open()
 
@@ -202,13 +200,13 @@ class EstimatorNode(ManagedNode):
             channel.tick()
         self.typed.publish()
 
-    def _answer(
-        self, channels: Iterable[Channel], act: Callable[..., str], request: Any, response: Any
-    ) -> Any:
-        """Answer a service by what channels do, who say it in one sentence."""
+    def _reset(self, channels: Iterable[Channel], _: Any, response: Any) -> Any:
+        """Answer the service that lets channels start afresh."""
+        response.success = True
+        response.message = 'the observer starts afresh with the next sample'
         for channel in channels:
-            response.success, response.message = True, act(channel, request)
-            channel.logger.info(f'{act.__name__}: {response.message}')
+            channel.reset()
+            channel.logger.info(f'reset: {response.message}')
         return response
 
     def _prepare(self, values: Parameters, changes: Mapping[str, Value]) -> None:

@@ -117,7 +117,6 @@ class LiveRun:
             yield slice(begins, position)
             if flags & Flag.RESET:
                 estimator.reset()
-            estimator.freeze(bool(np.any(values.get('frozen', False))))
             if found or estimator.latest == stamp:
                 ours, theirs = (
                     np.concatenate([np.ravel(memory.get(name, ())) for name in COMPARED])
