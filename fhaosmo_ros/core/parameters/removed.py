@@ -19,6 +19,9 @@ REMOVED = {
     'input_depth': "set 'qos_overrides./TOPIC.subscription.depth'",
     'divergence_limit': 'leave it out: samples beyond 1e60 are rejected',
     'sines': 'leave it out: a sum has 5 sines',
+    'known_input_stamps': 'leave it out: a sample gets the u that came before it; where u is '
+    "measured with y, take it from the message of y by 'known_input_fields'",
+    'known_input_wait': 'leave it out: samples do not wait for known inputs',
     'search': "leave it out: 'tune' searches the model of d, or the gains where 'lambda' is set",
     'unknown_input_unit': "leave it out: ~/joint_states has d times 'unknown_input_scale'",
     'event_release': 'leave it out: an event ends below half of what it has to exceed',

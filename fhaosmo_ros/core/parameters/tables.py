@@ -197,18 +197,9 @@ INPUT = (
     Parameter('known_input_types', [''], 'Their message types, as input_type.', live=False,
               lengths='1 (for all) or one each'),
     Parameter('known_input_fields', [''],
-              'The numbers in their messages, as input_field; also of the message of y.',
+              'The numbers in their messages, as input_field. One of the message of y is that of '
+              'its sample; of another message a sample gets the latest one that has arrived.',
               live=False, lengths='1 (for all) or one each'),
-    Parameter('known_input_stamps', ['reception'],
-              'reception: a sample gets the newest one that has arrived; one of the message of y '
-              'is that of its sample. header: the newest one whose header stamp is not after its '
-              'own; y is then read with that of its header, too.',
-              choices=('reception', 'header'), live=False, lengths='1 (for all) or one each'),
-    Parameter('known_input_wait', 0.0,
-              'How long, by the stamps of y, a sample waits until each input with '
-              'known_input_stamps = header has come with its stamp or a later one. Then the '
-              'order of arrival does not matter. For inputs that come about as often as y.',
-              unit='s', lower=0.0, upper=10.0, live=False),
 )  # fmt: skip
 
 CHANNEL_OUTPUT = (

@@ -2,7 +2,6 @@
 """One channel of an estimator node: y (and u) in, one observer, estimates out."""
 
 from functools import partial
-from math import isfinite
 from time import perf_counter
 from typing import Any
 
@@ -13,7 +12,7 @@ from fhaosmo_ros.core.online.events import described
 from fhaosmo_ros.core.online.snapshots import Flag, pack
 from fhaosmo_ros.core.parameters.declaration import Parameters
 from fhaosmo_ros.core.parameters.units import derivative_unit
-from fhaosmo_ros.inputs import known_inputs, measured_output, Pairing
+from fhaosmo_ros.inputs import known_inputs, measured_output
 from fhaosmo_ros.nodes.estimator.health import Health
 from fhaosmo_ros.nodes.estimator.outputs import estimate_messages
 from fhaosmo_ros.nodes.estimator.sources import Listener
@@ -62,7 +61,6 @@ class Channel:
         self._snapshots = node.create_publisher(Float64MultiArray, topic, LATCHED)
         self._period = PERIOD_OF_SELF_TUNING if estimator.observer.self_tuning else PERIOD
         self._due = 0.0  # when the next snapshot is, by perf_counter
-        self.pairing = Pairing(self.values, inputs, self.known, estimator.inputs)
         self.u: dict[str, Listener] = {}
         for u, its in self.known.items():
             self.u[u] = node.sources.add(its, partial(self._on_input, inputs.index(u)))
@@ -74,8 +72,6 @@ class Channel:
         self.reset()
         self._arrived, self.stale = False, True
         self._silent_since: int | None = None  # by the node's clock
-        self._waits_since = 0.0  # by perf_counter
-        self.pairing.forget_samples()
         self.health.begin()
         self._active = True
         if self.estimator.events.on:
@@ -96,34 +92,15 @@ class Channel:
         self._tell_snapshot(Flag.CHANGED)
         self.values = values
 
-    def _on_input(self, index: int, stamp: int, u: float) -> None:
-        if self.pairing.by_stamp and isfinite(u):
-            self.pairing.take_input(index, stamp, u)
-            self._take_paired()
-        else:
-            self.estimator.set_input(u, index)
+    def _on_input(self, index: int, _: int, u: float) -> None:
+        self.estimator.set_input(u, index)
 
     def _on_sample(self, stamp: int, y: float) -> None:
+        """Step the observer to a sample."""
         if not self._active:
             return
-        by_clock = self.values['sampling'] == 'clock'
-        time = self.clock.now().nanoseconds if by_clock else stamp
-        if self.pairing.by_stamp:
-            self.pairing.take_sample(stamp, (time, y))
-            self._waits_since = perf_counter()
-            self._take_paired()
-        else:  # in half the time
-            self._take(time, y)
-
-    def _take_paired(self, at_once: bool = False) -> None:
-        """Step to the samples whose known inputs are there."""
-        for (stamp, y), inputs in self.pairing.released(at_once):
-            for index, u in enumerate(inputs):
-                self.estimator.set_input(u, index)
-            self._take(stamp, y)
-
-    def _take(self, stamp: int, y: float) -> None:
-        """Step the observer to a sample."""
+        if self.values['sampling'] == 'clock':
+            stamp = self.clock.now().nanoseconds
         estimator, health, begin = self.estimator, self.health, perf_counter()
         word = estimator.advance(stamp, y)
         now = perf_counter()
@@ -149,9 +126,6 @@ class Channel:
 
     def tick(self) -> None:
         """Publish at the node's rate, if it is to, and until y is silent by the node's clock."""
-        waited = perf_counter() - self._waits_since
-        if self.pairing.by_stamp and waited > self.values['known_input_wait']:
-            self._take_paired(at_once=True)  # no sample follows that would release these
         if self._arrived:
             self._arrived = self.stale = False
             self._silent_since = None

@@ -41,12 +41,6 @@ UNUSED = {
 UNUSUAL = {
     'restarts': '{n} restarts: stamps jumped by more than max_gap; where y always comes so '
     'slowly, set max_gap to several of its periods',
-    'late inputs': '{n} late inputs, which came after their sample had been used: raise '
-    'known_input_wait, or their header stamps are of another clock',
-    'samples without their input': '{n} samples waited for a known input in vain: it stopped, or '
-    'its header stamps are 0, or of another clock',
-    'samples before any input': '{n} samples before any input, whose stamps are all later: are '
-    'the header stamps of one clock?',
 }
 """What is said of other counters of the input that have grown by `n`."""
 ZERO = {
@@ -89,9 +83,6 @@ class Health:
             'samples rejected': counters.rejected,
             **own,
             'restarts': counters.restarts,
-            'late inputs': channel.pairing.late,
-            'samples without their input': channel.pairing.lacking,
-            'samples before any input': channel.pairing.ahead,
             'events': channel.estimator.events.count,
         }
 

@@ -213,8 +213,8 @@ def find_wanted(types: Mapping[str, Any], wanted: Input, message_type: str) -> F
     field = find_field(types, message_type, wanted.field, wanted.name)
     if wanted.stamp == 'header' and not field.header:
         raise ConfigurationError(
-            "parameters 'input_stamp', 'known_input_stamps': expected messages with a header on "
-            f'{wanted.topic} for the stamps header, got {message_type}'
+            f"parameter 'input_stamp': expected messages with a header on {wanted.topic} for the "
+            f'stamps header, got {message_type}'
         )
     return field
 

@@ -6,8 +6,7 @@ Messages of two topics are never paired by counting: a recording may lack some o
 at its begin and at its end. What was published together is found by its stamps in the bag.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
-from heapq import merge
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 import warnings
 
@@ -15,15 +14,12 @@ from fhaosmo_ros.core.model.triangular import TriangularModel
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.files import loads
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
-from fhaosmo_ros.inputs import Input, known_inputs, measured_output, Pairing
+from fhaosmo_ros.inputs import Input, known_inputs, measured_output
 from fhaosmo_ros.messages.fields import Field
 from fhaosmo_ros.tools.bags.reader import BagReader, Samples
 from fhaosmo_ros.topics import PARAMETERS, TEXT
 import numpy as np
 from numpy.typing import NDArray
-
-SAMPLE = 1000
-"""A sample comes after the inputs that have its time."""
 
 
 class BagInputs:
@@ -73,42 +69,26 @@ class BagInputs:
         """
         Return the known inputs at samples of y, (K, m).
 
-        Samples and inputs are taken in the order of the bag, as the node takes them in that of
-        arrival; values that are not finite are left out. `held` are the inputs before the first
-        ones in the bag, else 0; of an input that nobody published, all the time, as in the node.
+        Each is the latest finite one that has come by the time of the sample in the bag, as the
+        node takes the latest one that has arrived. `held` are the inputs before the first ones in
+        the bag, else 0; of an input that nobody published, all the time, as in the node.
         """
         names = self._model.inputs
-        pairing = Pairing(self._values, names, self._u, held or [0.0] * len(names))
-        arrivals = [_arrivals(samples, SAMPLE)]
+        u = np.tile(held or [0.0] * len(names), (len(samples.times), 1))
         for name, its in self._u.items():
+            column = u[:, names.index(name)]
             if not self._reader.count(its.topic):
-                value = held[names.index(name)] if held else 0.0
                 warnings.warn(
-                    f'the bag has no messages on {its.topic}: {name} is held at {value:g}',
+                    f'the bag has no messages on {its.topic}: {name} is held at {column[0]:g}',
                     stacklevel=2,
                 )
                 continue
             field = self._reader.field(its.topic, its.field, its.name)
-            found = self._reader.samples(its.topic, field, its.stamp)
-            good = found.part(np.isfinite(found.values))
-            arrivals.append(_arrivals(good, names.index(name)))
-
-        def paired() -> Iterator[list[float]]:
-            for _, j, stamp, u in merge(*arrivals):
-                if j == SAMPLE:
-                    pairing.take_sample(stamp, None)
-                else:
-                    pairing.take_input(j, stamp, u)
-                yield from (row for _, row in pairing.released())
-            yield from (row for _, row in pairing.released(at_once=True))
-
-        return np.fromiter(paired(), np.dtype((np.float64, len(names))), len(samples.times))
-
-
-def _arrivals(samples: Samples, number: int) -> Iterator[tuple[int, int, int, float]]:
-    """Yield time in the bag, number of the input or `SAMPLE`, stamp, and value."""
-    for time, stamp, value in zip(*(column.tolist() for column in samples), strict=True):
-        yield time, number, stamp, value
+            found = self._reader.samples(its.topic, field)
+            found = found.part(np.isfinite(found.values))
+            known = np.append(column[0], found.values)
+            column[:] = known[np.searchsorted(found.times, samples.times, side='right')]
+        return u
 
 
 def read_ticks(reader: BagReader, name: str, parts: Sequence[str]) -> dict[str, NDArray[Any]]:
