@@ -14,7 +14,6 @@ import os
 from pathlib import Path
 import signal
 import sys
-from typing import Any
 import warnings
 
 from fhaosmo_ros import __version__
@@ -49,16 +48,8 @@ def run(name: str, arguments: list[str] | None = None) -> int:
     code = 0 if COMMANDS[name][0].startswith('.nodes.') else 130
     for number in ending_signals():
         signal.signal(number, lambda *_: os._exit(code))
-    usual = warnings.showwarning
     tell = cache(lambda text: print(f'{name}: warning: {text}', file=sys.stderr))
-
-    def show(warning: Warning | str, category: type[Warning], *place: Any) -> None:
-        if category is UserWarning:
-            tell(str(warning))
-        else:
-            usual(warning, category, *place)
-
-    warnings.showwarning = show  # ours in a line, once; Python's way has a path in the package
+    warnings.showwarning = lambda text, *_: tell(str(text))  # once, without a path in the package
     try:
         # Imported only now: a node needs ROS, and the help must not wait for numpy.
         gc.disable()  # nearly all that an import makes stays; looking for garbage takes 0.1 s
