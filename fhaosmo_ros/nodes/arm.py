@@ -24,7 +24,6 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 SILENT = 0.5  # seconds without a sample that are reported
-KIND = 15  # first letters of a text that tell its kind: names and numbers follow, and may change
 FIELDS = {
     'external_torque': {'effort': 'external_torque'},
     'standard_deviation': {'effort': 'standard_deviation'},
@@ -69,7 +68,7 @@ class ArmNode(BaseNode):
         self._arm: Arm | None = None
         self._description = ''
         self._problems: dict[str, str] = {}  # of each kind the last one, since the last report
-        self._logged: dict[str, float] = {}  # when each kind of problem was, by perf_counter
+        self._log = diagnostics.ReportLog(self)
         self._published, self._latest = -np.inf, -np.inf
         self._contact: bool | None = False  # None: not known
         self._estimate: ArmEstimate | None = None
@@ -114,9 +113,9 @@ class ArmNode(BaseNode):
                 self._use(message.data)
             except ConfigurationError as error:
                 self._missing = str(error)
-                self.get_logger().error(self._missing)
         elif message.data != self._description:
-            self._warn(f'a second robot on {self._topic} is ignored: start the node again for it')
+            text = f'a second robot on {self._topic} is ignored: start the node again for it'
+            self._problems['robot'] = text
 
     def _on_sample(self, message: JointState) -> None:
         """Take a message, if it is of this arm."""
@@ -127,7 +126,7 @@ class ArmNode(BaseNode):
             stamp, arrays = joint_sample(message, arm)
         except ConfigurationError as error:
             if not self._estimate or {*arm.joints} & {*message.name}:  # else of another robot
-                self._warn(f'{error}: no estimate from it')
+                self._problems['message'] = f'{error}: no estimate from it'
             return
         estimate = arm.take(stamp, *arrays)
         if arm.problem in MEANT:
@@ -137,9 +136,10 @@ class ArmNode(BaseNode):
                 for what, numbers in zip(('position', 'effort', 'velocity'), arrays, strict=False)
             )
             count = arm.counters[arm.problem]
-            self._warn(f'{MEANT[arm.problem]}{anew} ({count} so far; got {got})')
+            text = f'{MEANT[arm.problem]}{anew} ({count} so far; got {got})'
+            self._problems[arm.problem] = text
         if arm.doubts.text:
-            self._warn(arm.doubts.text)
+            self._problems['doubts'] = arm.doubts.text
         if estimate is None:
             return
         self._latest, self._estimate = perf_counter(), estimate
@@ -187,24 +187,15 @@ class ArmNode(BaseNode):
             self.get_logger().warning(f'event: {text}', throttle_duration_sec=QUIET)
         self._outputs['event'].publish(diagnostics.array_of(self, when, [report]))
 
-    def _warn(self, text: str) -> None:
-        """Log a problem, each kind at most every `QUIET` seconds, and report it."""
-        now, kind = perf_counter(), text[:KIND]
-        if now - self._logged.get(kind, -np.inf) > QUIET:
-            self._logged[kind] = now
-            self.get_logger().warning(text)
-        self._problems[kind] = text
-
     def _reports(self) -> list[diagnostics.Report]:
         report = diagnostics.Report('arm')
         for problem in self._problems.values():
             report.find(WARN, problem)
         self._problems.clear()
+        silent = perf_counter() - self._latest
         if self._arm is None:
             report.find(ERROR, self._missing)
-            return [report]
-        silent = perf_counter() - self._latest
-        if not silent < SILENT:
+        elif not silent < SILENT:
             topic = self.resolve_topic_name(self.values['input_topic'])
             since = f'for {silent:.3g} s' if np.isfinite(silent) else 'yet'
             report.find(ERROR, f'no usable sample on {topic} {since}: nothing is published')
@@ -214,7 +205,9 @@ class ArmNode(BaseNode):
         elif self._estimate is not None:
             report.values['log odds of contact'] = self._estimate.log_odds
             report.values['contact'] = self._estimate.link or 'none'
-        report.values |= {f'samples {what}': n for what, n in self._arm.counters.items()}
+        if self._arm is not None:
+            report.values |= {f'samples {what}': n for what, n in self._arm.counters.items()}
+        self._log.tell([report])
         return [report]
 
     def _prepare(self, values: Parameters, _: Mapping[str, Value]) -> Parameters:

@@ -103,7 +103,7 @@ def test_publishers_are_named(user, estimator, stranger):
     rig = estimator('/heard', **FED)
     found = rig.wait_status('input', STALE, 'no usable sample yet', 'no publisher of /heard/y')
     assert found['publishers'] == 'none'
-    rig.wait_said('[WARN]', 'input: no usable sample yet; no publisher of /heard/y')
+    rig.wait_said('[WARN]', 'input: no publisher of /heard/y')
 
     for kind, qos, *words in (
         (Float64, BEST_EFFORT, 'best effort publisher and reliable subscription', '/y.subscrip'),
@@ -207,7 +207,7 @@ def test_gap_stops_the_output_and_restarts_the_observer(fed):
     fed.wait_count('restarts', before + 1)
 
 
-def test_a_thing_that_reports_say_is_logged_at_most_every_five_seconds(fed):
+def test_what_reports_say_is_logged_at_most_every_five_seconds(fed):
     """Each sample is a jump of the stamps, or no number."""
     begin, said = time.monotonic(), len(fed.said('input: '))
     restarts, rejected = fed.count('restarts'), fed.count('rejected measurements')
@@ -221,7 +221,7 @@ def test_a_thing_that_reports_say_is_logged_at_most_every_five_seconds(fed):
     fed.user.wait(lambda: fed.send(1.0) and said_so(), 'line of the log')
     lines = [line.partition('input: ')[2] for line in fed.said('input: ')[said:]]
     kinds = [re.sub(r'[-+.\d]+', '', line) for line in lines]
-    assert max(map(kinds.count, kinds)) <= 2 + (time.monotonic() - begin) // 5.0
+    assert max(map(kinds.count, kinds), default=0) <= 2 + (time.monotonic() - begin) // 5.0
 
 
 @pytest.fixture

@@ -177,7 +177,7 @@ class EstimatorNode(ManagedNode):
 
     def activate(self) -> None:
         """Take samples and publish."""
-        self._log = diagnostics.ReportLog(self)
+        self._log = diagnostics.ReportLog(self, diagnostics.BEGIN)
         for channel in self._channels:
             channel.activate()
         if self._channels:

@@ -22,6 +22,7 @@ OK, WARN = DiagnosticStatus.OK, DiagnosticStatus.WARN
 ERROR, STALE = DiagnosticStatus.ERROR, DiagnosticStatus.STALE
 PERIOD, QUIET, BEGIN = 1.0, 5.0, 5.0
 """Seconds."""
+NUMBER = re.compile(r'[-+.\d]+(e[-+]\d+)?')
 
 
 @dataclass
@@ -30,19 +31,22 @@ class Report:
 
     task: str
     values: dict[str, Any] = field(default_factory=dict)
-    findings: list[str] = field(default_factory=list)
-    level: bytes = OK
+    findings: list[tuple[bytes, str]] = field(default_factory=list)
 
     def find(self, level: bytes, text: str, when: object = True) -> None:
         """Add a finding where `when` is true; the status gets the worst level and all texts."""
         if when:
-            self.level = max(self.level, level)
-            self.findings.append(text)
+            self.findings.append((level, text))
+
+    @property
+    def level(self) -> bytes:
+        """The worst level of the findings."""
+        return max((level for level, _ in self.findings), default=OK)
 
     @property
     def text(self) -> str:
         """All findings in a line."""
-        return '; '.join(self.findings) or 'OK'
+        return '; '.join(text for _, text in self.findings) or 'OK'
 
 
 def array_of(node: BaseNode, stamp: Time, reports: Iterable[Report]) -> DiagnosticArray:
@@ -63,34 +67,33 @@ def array_of(node: BaseNode, stamp: Time, reports: Iterable[Report]) -> Diagnost
 
 class ReportLog:
     """
-    Logs reports that are not OK, each once it says something new, a thing at most every `QUIET` s.
+    Logs findings that are not OK, each once, and again after `QUIET` seconds without it.
 
-    In the first `BEGIN` seconds these are errors only: publishers and subscriptions need some time
+    In the first `begin` seconds these are errors only: publishers and subscriptions need some time
     to find each other.
     """
 
-    def __init__(self, node: BaseNode) -> None:
-        self._logger = node.get_logger()
-        self._begun = monotonic() + BEGIN
-        self._latest: dict[str, str] = {}  # by task: what the report before has said
-        self._quiet: dict[str, float] = {}  # by what was said: when it may be said again
+    def __init__(self, node: BaseNode, begin: float = 0.0) -> None:
+        self._node, self._begun = node, monotonic() + begin
+        self._found: dict[str, float] = {}  # when each thing was found last
 
     def tell(self, reports: Iterable[Report]) -> None:
-        """Log those of the present reports that are to be."""
-        now = monotonic()
-        self._quiet = {said: end for said, end in self._quiet.items() if end > now}
+        """Log what is new in the present reports."""
+        now, log = monotonic(), self._node.get_logger()
+        quiet = max(QUIET, 2.0 * self._node.values['diagnostics_period'])
+        self._found = {kind: at for kind, at in self._found.items() if now - at < quiet}
         for report in reports:
-            if now < self._begun and report.level != ERROR:
-                continue
-            text = f'{report.task}: {report.text}'
-            kind = re.sub(r'[-+.\d]+', '', text)  # numbers are others each time
-            before, self._latest[report.task] = self._latest.get(report.task), kind
-            if report.level != OK and kind != before and kind not in self._quiet:
-                if report.level == ERROR:  # rclpy wants a line of its own for each severity
-                    self._logger.error(text)
-                else:
-                    self._logger.warning(text)
-                self._quiet[kind] = now + QUIET
+            for level, finding in report.findings:
+                if level == OK or (now < self._begun and level != ERROR):
+                    continue
+                text = f'{report.task}: {finding}'
+                kind = NUMBER.sub('', text)  # numbers are others each time
+                new = kind not in self._found
+                self._found[kind] = now
+                if new and level == ERROR:  # rclpy wants a line of its own for each severity
+                    log.error(text)
+                elif new:
+                    log.warning(text)
 
 
 def publish_diagnostics(node: BaseNode, reports: Callable[[], Iterable[Report]]) -> None:
