@@ -213,13 +213,7 @@ class EstimatorNode(ManagedNode):
         """Raise for changes that can not be, with the name of the channel."""
         if self._parameters_topic is None:  # configure checks whether the values fit together
             return
-        present = self.values
-        for name, value in changes.items():
-            if not values.table[name].live and value != present[name]:
-                raise ConfigurationError(
-                    f"parameter '{name}': read when the node is configured (it is "
-                    f'{present[name]!r}), got {value!r}; set it after the transition cleanup'
-                )
+        self.values.changed_live(changes, 'node; set it after the transition cleanup')
         for channel in self._channels:
             with naming_channel(channel.name):
                 channel.estimator.prepare(of_channel(values, channel.name))
