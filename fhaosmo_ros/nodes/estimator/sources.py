@@ -19,7 +19,6 @@ from fhaosmo_ros.nodes.middleware import endpoints
 from fhaosmo_ros.nodes.middleware.messages import definitions, message_class
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
-from rclpy.qos import qos_check_compatible, QoSCompatibility
 
 DISCOVERY_PERIOD = 0.2
 Take = Callable[[int, float], None]
@@ -61,10 +60,10 @@ class Source:
     A topic and all that its messages are read for.
 
     `message_type` is '' while it is not known. Of the publishers that `look` has seen, `heard` are
-    the nodes that can be heard; `unheard` has for each other one a sentence that names the node
-    and says what to do about it. `numbers.lost` messages did not arrive, or were damaged, which
-    the middleware drops. `delay` is the longest time from a publication to its callback between
-    the latest two looks (ns), `offset` that from the latest header's stamp to its publication.
+    the nodes that publish this type; `unheard` has a sentence on each other one. `numbers.lost`
+    messages did not arrive, or were damaged, which the middleware drops. `delay` is the longest
+    time from a publication to its callback between the latest two looks (ns), `offset` that from
+    the latest header's stamp to its publication.
     `on_names` is called with the names in each message.
     """
 
@@ -110,29 +109,21 @@ class Source:
             )  # fmt: skip
 
     def look(self) -> None:
-        """Look at the topic's publishers in the ROS graph: QoS events do not name them."""
+        """Look at the topic's publishers in the ROS graph; rclpy logs QoS that does not match."""
         if self._subscription is None:
             return
         self.delay, self._delay = self._delay, -math.inf
         self.heard, self.unheard = [], []
         for endpoint in self._node.get_publishers_info_by_topic(self.topic):
             name = f'{endpoint.node_namespace.rstrip("/")}/{endpoint.node_name}'
-            if reason := self._mismatch(endpoint):
-                self.unheard.append(f'{name} publishes {self.topic} unheard: {reason}')
-            else:
+            if endpoint.topic_type == self.message_type:
                 self.heard.append(name)
+            else:
+                self.unheard.append(
+                    f'{name} publishes {self.topic} unheard: its type is {endpoint.topic_type}, '
+                    f'expected {self.message_type}'
+                )
         self.numbers.single = len(self.heard) <= 1
-
-    def _mismatch(self, endpoint: Any) -> str:
-        """Return why a publisher can't be heard, '' if it can."""
-        if endpoint.topic_type != self.message_type:
-            return f'its type is {endpoint.topic_type}, expected {self.message_type}'
-        own = self._subscription.qos_profile
-        verdict, reason = qos_check_compatible(endpoint.qos_profile, own)
-        if verdict != QoSCompatibility.ERROR:
-            return ''
-        hint = f'change qos_overrides.{self.topic}.subscription, or its own QoS'
-        return f'{reason.rstrip(";").lower()}; {hint}'
 
     def _on_message(self, message: Any, info: Mapping[str, Any]) -> None:
         published = info['source_timestamp']

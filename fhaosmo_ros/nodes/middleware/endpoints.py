@@ -11,7 +11,6 @@ from typing import Any
 
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.nodes.middleware.node import BaseNode
-from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSPolicyKind, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
@@ -125,10 +124,7 @@ def subscribe_with_info(
 
     # rclpy delivers the info if the signature has two parameters.
     adapter.__signature__ = inspect.signature(lambda message, info: None)  # type: ignore[attr-defined]
-    return node.create_subscription(
-        message_type, topic, adapter, qos,
-        event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False), **options,
-    )  # fmt: skip
+    return node.create_subscription(message_type, topic, adapter, qos, **options)
 
 
 class SequenceNumbers:
