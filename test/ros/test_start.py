@@ -83,6 +83,7 @@ def in_files(words: list[str], folder: Path) -> list[str]:
     return result
 
 
+@pytest.mark.filterwarnings('ignore::DeprecationWarning')  # of what the arm imports
 @pytest.mark.parametrize(('node', 'words', 'expected'), REFUSED)
 def test_one_line_says_what_is_wrong(node, words, expected, tmp_path, capfd):
     if node == 'arm':
