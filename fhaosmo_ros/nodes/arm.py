@@ -64,7 +64,6 @@ class ArmNode(BaseNode):
     def __init__(self, given: Mapping[str, Any]) -> None:
         super().__init__('arm', given)
         values = self.values
-        endpoints.check_overrides(self, [f'~/{topic}' for topic in (*FIELDS, *OTHERS)])
         self._arm: Arm | None = None
         self._description = ''
         self._problems: dict[str, str] = {}  # of each kind the last one, since the last report

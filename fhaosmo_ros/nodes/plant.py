@@ -8,7 +8,7 @@ from typing import Any
 
 from fhaosmo_ros.core.parameters.declaration import Parameters, Value
 from fhaosmo_ros.core.simulation.plant import Plant
-from fhaosmo_ros.nodes.middleware.endpoints import check_overrides, create_publisher, set_period
+from fhaosmo_ros.nodes.middleware.endpoints import create_publisher, set_period
 from fhaosmo_ros.nodes.middleware.messages import labelled
 from fhaosmo_ros.nodes.middleware.node import BaseNode
 from fhaosmo_ros.nodes.middleware.spin import run_node
@@ -36,7 +36,6 @@ class PlantNode(BaseNode):
         self._now: int | None = None  # of the node's clock, in ns, and the time of the plant
         self._time = 0
         self._state_message = labelled([f'z{i + 1}' for i in range(self.plant.model.order)])
-        check_overrides(self, TOPICS)
         self._publish_y, self._publish_state, self._publish_d = (
             create_publisher(self, kind, topic).publish for topic, kind in TOPICS.items()
         )

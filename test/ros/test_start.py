@@ -63,11 +63,14 @@ REFUSED = [
     (E, rules('channels:=[a, b]', 'typed_outputs:=[wrench]'), ["'output_axis'", 'linear.x']),
     (E, rules('channels:=[hip]', 'hip.order:=2'),
      ["channel 'hip': parameter 'phi': expected 2 expressions"]),
+    (E, rules(f'channels:=[{"a" * 230}]'), ['the name of a topic', 'length', '/standard_dev']),
     # QoS.
     (E, rules('qos_overrides./estimator/state.publisher.reliability:=sometimes'),
-     ['/estimator/state', 'sometimes']),
-    (P, rules('qos_overrides./yy.publisher.depth:=5'),
-     ["'qos_overrides./yy.publisher.depth': expected qos_overrides.ENDPOINT.POLICY", '/y.pub']),
+     ["/estimator/state.publisher.reliability': expected one of reliable, best", 'sometimes']),
+    *((E, rules(f'qos_overrides./y.subscription.depth:={depth}'), ['expected an integer >= 1'])
+      for depth in ('-5', '0', 'five', 'true', '2.5', '4000000000', '[5]')),
+    (P, rules('qos_overrides./y.publisher.durability:=1'), ['one of volatile', 'got 1']),
+    (P, rules('qos_overrides./y.publisher.dept:=5'), ["y.publisher.dept'", "mean 'depth'"]),
 ]  # fmt: skip
 
 

@@ -18,10 +18,10 @@ from fhaosmo_ros.nodes.estimator.outputs import parameter_text, TypedOutputs
 from fhaosmo_ros.nodes.estimator.sources import check_inputs, Sources
 from fhaosmo_ros.nodes.middleware import diagnostics
 from fhaosmo_ros.nodes.middleware.diagnostics import ERROR, OK, Report, STALE, WARN
-from fhaosmo_ros.nodes.middleware.endpoints import check_overrides, full_name, set_period
+from fhaosmo_ros.nodes.middleware.endpoints import full_name, set_period
 from fhaosmo_ros.nodes.middleware.lifecycle import ManagedNode
 from fhaosmo_ros.nodes.middleware.spin import run_node
-from fhaosmo_ros.topics import estimates_of, EVENT, PARAMETERS, STANDARD_DEVIATION
+from fhaosmo_ros.topics import PARAMETERS, STANDARD_DEVIATION
 from rclpy.parameter import Parameter as RosParameter
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_msgs.msg import String
@@ -66,15 +66,13 @@ class EstimatorNode(ManagedNode):
         names: list[str] = values[CHANNELS]
         if names == FROM_JOINTS:  # which joints there are is not known yet, but some may be named
             names = [*names, *per_channel.channels_with_own(values)]
-        channels, inputs, estimates = [], [], []
+        channels, inputs = [], []
         for name in names:
             with naming_channel(name):
                 channels.append(channel := Channel(self, of_channel(values, name), name))
             inputs += [channel.measured, *channel.known.values()]
-            topics = [*estimates_of(channel.values), EVENT]
-            estimates += [channel.prefix + topic for topic in topics]
+            full_name(self, channel.prefix + STANDARD_DEVIATION)  # its longest topic
         check_inputs(self, inputs)
-        check_overrides(self, estimates, [wanted.topic for wanted in inputs])
         axes = [channel.values['output_axis'] for channel in channels[: len(values[CHANNELS])]]
         if {'wrench', 'accel'} & set(values['typed_outputs']) and len(set(axes)) < len(axes):
             raise ConfigurationError(

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Publishers and subscriptions with QoS that a user may override; periods of timers."""
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from copy import copy
 import inspect
 import math
@@ -10,7 +10,6 @@ from time import monotonic
 from typing import Any
 
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
-from fhaosmo_ros.nodes.middleware.node import BaseNode
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSPolicyKind, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
@@ -27,19 +26,11 @@ LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 """Who comes later still gets the latest messages."""
 SENSOR_QOS = QoSProfile(depth=DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
 """Best effort matches every publisher; the queue holds one second at 1 kHz."""
-MOST_KEPT = 100_000
-"""Largest depth."""
-POLICIES: dict[QoSPolicyKind, tuple[str, ...] | range] = {
-    QoSPolicyKind.HISTORY: ('keep_last', 'keep_all'),
-    QoSPolicyKind.DEPTH: range(1, MOST_KEPT + 1),
-    QoSPolicyKind.RELIABILITY: ('reliable', 'best_effort'),
-    QoSPolicyKind.DURABILITY: ('volatile', 'transient_local'),
-}
-"""QoS policies that a user may override, with the values that each may have."""
-OVERRIDABLE = QoSOverridingOptions(POLICIES)
-OVERRIDES = 'qos_overrides.'
-OF_RCLPY = tuple(f'{OVERRIDES}{topic}.' for topic in ('/clock', '/parameter_events', '/rosout'))
-"""Topics whose QoS can be overridden in every node of rclpy."""
+OVERRIDABLE = QoSOverridingOptions((
+    QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH,
+    QoSPolicyKind.RELIABILITY, QoSPolicyKind.DURABILITY,
+))  # fmt: skip
+"""QoS policies that a user may override."""
 
 
 def create_publisher(node: Node, kind: Any, topic: str, latched: bool = False) -> Any:
@@ -80,31 +71,6 @@ def full_name(node: Node, topic: str, what: str = '') -> str:
         problem = re.sub(r'^.*?: |, at \S+$', '', str(error))
         text = f'{what}expected the name of a topic, got {topic!r} ({problem})'
         raise ConfigurationError(text) from None
-
-
-def check_overrides(
-    node: BaseNode, published: Iterable[str], subscribed: Iterable[str] = ()
-) -> None:
-    """
-    Raise for QoS overrides that rclpy would ignore, or refuse with an unclear message.
-
-    `published` and `subscribed` are all topics whose publishers and subscriptions the node makes
-    `OVERRIDABLE`.
-    """
-    endpoints = [f'{full_name(node, topic)}.publisher' for topic in published]
-    endpoints += [f'{full_name(node, t)}.subscription' for t in dict.fromkeys(subscribed)]
-    policies = {policy.name.lower(): allowed for policy, allowed in POLICIES.items()}
-    for name, value in node.given.items():
-        if not name.startswith(OVERRIDES) or name.startswith(OF_RCLPY):
-            continue
-        endpoint, _, policy = name.removeprefix(OVERRIDES).rpartition('.')
-        if endpoint not in endpoints or value not in policies.get(policy, ()):
-            raise ConfigurationError(
-                f"parameter '{name}': expected {OVERRIDES}ENDPOINT.POLICY with ENDPOINT one of "
-                f'{", ".join(endpoints)}, and depth: 1 to {MOST_KEPT}, history: keep_last or '
-                'keep_all, reliability: reliable or best_effort, durability: volatile or '
-                f'transient_local; got {value!r}'
-            )
 
 
 def subscribe_with_info(

@@ -2,9 +2,10 @@
 """What every node is: its parameters, declared in the core, become those of ROS, also live."""
 
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from typing import Any
 
-from fhaosmo_ros.core.parameters.declaration import Parameter, Parameters, shown, suggestion
+from fhaosmo_ros.core.parameters.declaration import Parameter, Parameters, suggestion
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.per_channel import BUILT_IN, complete, is_built_in, split
 from fhaosmo_ros.core.parameters.tables import NODE_TABLES
@@ -14,6 +15,13 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 from rosgraph_msgs.msg import Clock
 
+POLICIES = {p.name: p for p in (
+    Parameter('depth', 1, '', lower=1, upper=100_000),
+    Parameter('history', '', '', choices=('keep_last', 'keep_all')),
+    Parameter('reliability', '', '', choices=('reliable', 'best_effort')),
+    Parameter('durability', '', '', choices=('volatile', 'transient_local')),
+)}  # fmt: skip
+"""QoS policies that a user may override."""
 STEPS = 100.0
 """Of a slider: none where one of them would exceed the default, as bounds then say nothing."""
 
@@ -54,14 +62,25 @@ def descriptor(parameter: Parameter, read_only: bool) -> ParameterDescriptor:
 
 
 def built_in(given: Mapping[str, Any]) -> list[RosParameter]:
-    """Return those given parameters that are rclpy's own, such as use_sim_time."""
-    own = {name: value for name, value in given.items() if is_built_in(name)}
-    for name, value in own.items():
-        flag = name in BUILT_IN
-        if not isinstance(value, bool if flag else bool | int | float | str):
-            problem = f'expected {"true or false" if flag else "one value"}, got {shown(value)}'
-            raise ConfigurationError(f"parameter '{name}': {problem}")
-    return [RosParameter(name, value=value) for name, value in own.items()]
+    """
+    Return those given parameters that are rclpy's own: use_sim_time, QoS overrides.
+
+    They are checked here: rclpy ends with a traceback, or goes on without the topic.
+    """
+    result = []
+    for name in filter(is_built_in, given):
+        policy = name.rpartition('.')[2]
+        if name in BUILT_IN:
+            declared = Parameter(name, False, '')
+        elif policy in POLICIES:
+            declared = replace(POLICIES[policy], name=name)
+        else:
+            problem = f'expected one of {", ".join(POLICIES)} at its end'
+            raise ConfigurationError(
+                f"parameter '{name}': {problem}{suggestion(policy, POLICIES)}"
+            )
+        result.append(RosParameter(name, value=declared.coerce(given[name])))
+    return result
 
 
 class BaseNode(Node):
@@ -84,7 +103,6 @@ class BaseNode(Node):
     ) -> None:
         values = complete(given, NODE_TABLES[name])
         super().__init__(name, parameter_overrides=built_in(given), enable_logger_service=True)
-        self.given = given
         not_live = (p.name for p in values.table.values() if not p.live)
         self._read_only = set(not_live if fixed is None else fixed)
         self.extend(values)
