@@ -28,8 +28,6 @@ TRUE_STYLE = {'color': '#0072B2', 'linewidth': 2.2, 'label': 'true'}
 """Blue of the Okabe-Ito palette."""
 COLOURS = ('#D55E00', '#009E73', '#CC79A7', '#E69F00', '#56B4E9')
 """Okabe-Ito palette, without the blue of the truth; each curve also has its own dashes."""
-OTHERS = ('#bbbbbb', *COLOURS[1:])
-"""Of what the run is compared with: what chatters is grey."""
 DASHES = ('-', '--', '-.', ':')
 COLUMNS = 1500
 """Of a thinned curve; more than a figure has pixels in a row."""
@@ -209,25 +207,22 @@ def _columns(t: NDArray[Any]) -> NDArray[np.intp]:
     return np.flatnonzero(np.diff(column, prepend=-1))
 
 
-def save_curves(
-    curves: list[Curves],
-    path: Path,
-    compared: Sequence[Curves] = (),
-    marks: Sequence[tuple[int, str]] = (),
-) -> None:
+def save_curves(curves: list[Curves], path: Path, marks: Sequence[tuple[int, str]] = ()) -> None:
     """
     Write a figure of several estimates laid one over another.
 
-    From top to bottom: a row for each state, for d, for errors of d of the first estimate and
-    those it is `compared` with, for gamma if an estimate has it, and for the innovations of the
-    first estimate. `marks` are times (ns) at which something changed, and what.
+    From top to bottom: a row for each state, for d, for the error of d where the truth is known,
+    for gamma if an estimate has it, and for the innovations of the first estimate. `marks` are
+    times (ns) at which something changed, and what.
     """
     first, names = curves[0], max((c.names for c in curves), key=len)
     gamma = ['gamma'] if any(c.gamma is not None for c in curves) else []
-    rows = [*names, *(['error of d'] if compared else []), *gamma, 'innovation']
+    error = ['error of d'] if any(c.truth is not None for c in curves) else []
+    rows = [*names, *error, *gamma, 'innovation']
     figure = Figure(figsize=(8.5, 1.45 * len(rows) + 0.9), layout='constrained')
     axes = figure.subplot_mosaic([[row] for row in rows], sharex=True)
     origin = min(c.stamps[0] for c in curves)
+    errors_alone = []  # lines of curves that are in no other row
     for number, c in enumerate(curves):
         colour, dashes = COLOURS[number % len(COLOURS)], DASHES[number % len(DASHES)]
         style = {'color': colour, 'linestyle': dashes, 'linewidth': 1.2, 'label': c.label}
@@ -239,6 +234,10 @@ def save_curves(
             row.plot(*envelope(t, c.estimate[:, k]), **style)
             if c.deviation is not None:
                 draw_band(row, t, c.estimate[:, k], c.deviation[:, k], colour)
+        if c.truth is not None:
+            missed = c.estimate[:, -1] - c.truth[:, -1]
+            drawn = axes['error of d'].plot(*envelope(t, missed), **style)
+            errors_alone += drawn if not c.names else []
         for begin, end in (np.array(c.events).reshape(-1, 2) - origin) * 1e-9:
             axes['d'].axvspan(begin, end, color=colour, alpha=0.12, linewidth=0.0)
         if c.gamma is not None:
@@ -257,24 +256,17 @@ def save_curves(
     t = (first.stamps - origin) * 1e-9
     _draw_innovations(axes['innovation'], t, first.innovation, first.epsilon)
     axes['innovation'].set_ylabel('|innovation|' + ('\n(first)' if len(curves) > 1 else ''))
-    if compared:
-        row = axes['error of d']
-        for c, colour in zip([*compared, first], OTHERS, strict=False):
-            error = c.estimate[:, -1] - c.truth[:, -1]
-            row.plot(*envelope(t, error), linewidth=0.8, label=c.label, color=colour)
-        row.lines[-1].set(color=COLOURS[0], linestyle='--', linewidth=1.2)  # the run itself
-        size = 1.5 * float(np.nanmax(np.abs(first.estimate[:, -1])))
-        row.set_ylim(-size, size)  # what is beyond leaves the picture
-        row.set_ylabel('error of d')
-        row.legend(loc='upper right', ncols=len(row.lines), fontsize='x-small')
+    if error:  # as large as in the row of d; what is beyond leaves the picture
+        size = max(map(abs, axes['d'].get_ylim()))
+        axes['error of d'].set(ylim=(-size, size), ylabel='error of d')
     for row in axes.values():
         row.grid(alpha=0.3)
         for stamp, _ in marks:
             row.axvline((stamp - origin) * 1e-9, color='black', linewidth=0.8, linestyle=':')
     axes['d'].set_title(', '.join(words for _, words in marks), fontsize='small', loc='right')
     axes[rows[-1]].set_xlabel('time since the first estimate [s]')
-    handles, labels = axes[rows[0]].get_legend_handles_labels()
-    figure.legend(handles, labels, loc='outside upper center', ncols=2, fontsize='small')
+    handles = axes[rows[0]].get_legend_handles_labels()[0] + errors_alone
+    figure.legend(handles=handles, loc='outside upper center', ncols=2, fontsize='small')
     figure.savefig(path, dpi=150)
 
 
