@@ -112,6 +112,7 @@ def too_few_states():
     (lambda: np.where(T < 1.0, noise(), np.nan), PHI, 'at least 500 samples'),
     (lambda: plant()[:, 0] + lfilter([1.0], [1.0, -0.9], noise()), PHI, 'noise correlated'),
     (too_few_states, ['0', '-2*z2', '0'], 'order'),
+    (lambda: 3.0 + plant()[:, 0] + noise(), ['0', '-2*z2 - sqrt(z1)'], 'slopes at z = 0'),
 ])  # fmt: skip
 @pytest.mark.filterwarnings('error')
 def test_where_there_are_no_gains_it_says_why(y, phi, about):

@@ -186,7 +186,7 @@ def notes(found: Identification, correlation: float, probability: float) -> Iter
             f'{found.outliers} samples ({found.outliers / len(samples.y):.2%}) are outliers. They '
             'were left out; the estimator rejects such samples, too.'
         )
-    rates = model.jacobian(np.zeros(model.order)) + np.eye(model.order, k=1)
+    rates = model.slopes_at_rest + np.eye(model.order, k=1)
     growth = float(np.linalg.eigvals(rates).real.max())
     if growth * whole > SURE:
         yield (

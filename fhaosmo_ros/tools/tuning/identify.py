@@ -113,7 +113,6 @@ class Identification:
         used = np.ones(count, dtype=bool)
         self.samples = Samples(h, periods, y, np.ascontiguousarray(u), used)
         self._longest = values['prediction_step'] or usual_step(model)
-        self._jacobian = model.jacobian(np.zeros(model.order))
         # How far off z_1 .. z_n may be where the filter begins: a first guess.
         block = max(count // 300, 1)
         slow = y[: count // block * block].reshape(-1, block).mean(axis=1)
@@ -176,7 +175,7 @@ class Identification:
         n, noise = self.model.order, self._noise**2
         size, q = n + 1 + design.derivatives, self.intensity(design, self._noise)
         rates = np.eye(size, k=1)
-        rates[:n, :n] += self._jacobian
+        rates[:n, :n] += self.model.slopes_at_rest
         rates[range(n, size), range(n, size)] = -design.decay
         a, added = LinearModel(rates, q).transition(self.period)
         fresh = np.zeros((size, size))
@@ -304,8 +303,7 @@ class Identification:
             **self._given,
         }
         checked = OBSERVER_PARAMETERS.complete(OBSERVER_PARAMETERS.part_of(values))
-        lambdas, errors = kalman_gains(checked, period)
-        values['lambda'] = [rounded(x) for x in lambdas]
+        values['lambda'], errors = kalman_gains(checked, period)
         share = errors[order] / of_d
         if share > UNSEEN:
             raise ConfigurationError(

@@ -42,15 +42,15 @@ def chosen_otherwise(estimator: Mapping[str, Any]) -> list[str]:
     return found + [name for name in fit_one_scheme if name in estimator]
 
 
-def kalman_gains(p: Mapping[str, Any], period: float) -> tuple[Floats, Floats]:
+def kalman_gains(p: Mapping[str, Any], period: float) -> tuple[list[float], Floats]:
     """
     Return lambda with which predict_correct is the Kalman filter that parameters ask for (D 19).
 
     `p` are all of the observer's: its model, noise_size, the model of d, the first of fuzzy_widths
-    for all levels, and gamma_initial; `period` is that of sampling (s). Behind the (N,) lambda are
-    the standard deviations of the errors of the filter's estimates, once they are steady. Raises
-    ConfigurationError where there is no such filter in floating-point numbers, or psi is 0 at the
-    size of the noise.
+    for all levels, and gamma_initial; `period` is that of sampling (s). Behind the N rounded
+    lambda are the standard deviations of the errors of the filter's estimates, once they are
+    steady. Raises ConfigurationError where there is no such filter in floating-point numbers, or
+    psi is 0 at the size of the noise.
     """
     model = TriangularModel.of(p)
     uncertainty = Uncertainty(model, p, np.zeros(model.order))
@@ -73,7 +73,8 @@ def kalman_gains(p: Mapping[str, Any], period: float) -> tuple[Floats, Floats]:
         raise ConfigurationError(f'Kalman gain: expected psi > 0 at {small:g}, got {psi}')
     lambdas = injections * small ** (1.0 - power) / psi
     lambdas = lambdas.clip(LEAST, OBSERVER_PARAMETERS['lambda'].upper)
-    return lambdas, np.sqrt(np.maximum(np.diag(predicted) - gain**2 * variance, 0.0))
+    errors = np.sqrt(np.maximum(np.diag(predicted) - gain**2 * variance, 0.0))
+    return [*map(rounded, lambdas)], errors
 
 
 def rounded(value: float) -> float:

@@ -224,14 +224,13 @@ class Tuner:
 
         Raises ConfigurationError for values that are out of bounds, or do not fit together.
         """
-        changes = _changes(values)
-        found = self._fixed | changes
+        found = self._fixed | _changes(values)
         p = ESTIMATOR_PARAMETERS.complete(found)
-        if self._noise and 'lambda' not in changes:
+        if self._noise:
             power = p['gamma_initial'] if p['variant'].endswith('_adaptive') else FIXED_GAMMA
             noise = p['noise_size'] or self._noise
             design = p.changed({'noise_size': noise, 'gamma_initial': power})
-            found['lambda'] = [*map(rounded, kalman_gains(design, self._period)[0])]
+            found['lambda'], _ = kalman_gains(design, self._period)
             if not p['noise_size']:  # nothing says how sure the observer is
                 found.pop('unknown_input_size')
         if p['structure'] == 'levant' and p['variant'].startswith('fuzzy') and not p['noise_size']:
