@@ -160,7 +160,7 @@ LATE = {'gains': 'fixed', 'measurement_delay': 0.1, 'phi': ['u', '0', '0']}
 
 @pytest.mark.parametrize(('name', 'number'), [
     ('past_place', -1), ('past_place', 512), ('past_count', 513), ('event', 6), ('intervals', 33),
-    ('regular', -1), ('lost', 2), ('latest', 2**63), ('latest', 0.5), ('latest', 'x'),
+    ('repeated', 1.5), ('lost', 2), ('latest', 2**63), ('latest', 0.5), ('latest', 'x'),
     ('mean_interval', -1.0), ('mean_interval', np.nan), ('held_y', np.inf), ('z_hat', np.zeros(3)),
     ('z_hat', np.full(4, np.nan)), ('past_pieces', np.full((512, 2), np.inf)), ('u', np.zeros(2)),
     ('past_latest', None), ('version', 2), ('spread', 0.0),

@@ -22,9 +22,9 @@ RANGES: dict[str, tuple[float, float]] = {
     **dict.fromkeys(('saturated', 'narrowed'), NOT_NEGATIVE),
     'beyond': (0.0, math.inf),
     **dict.fromkeys(('spread', 'scale'), AT_LEAST_1),
-    **dict.fromkeys(('spikes', 'tick_count', 'repeats', 'held_for'), COUNTS),
+    **dict.fromkeys(('spikes', 'tick_count', 'repeats'), COUNTS),
     **dict.fromkeys(('mean_interval', 'longest_mean'), COUNTS),
-    'intervals': (0, 32), 'regular': (0, 12), 'ticks': (-5000, 2**17), 'elsewhere': (0.0, 1.0),
+    'intervals': (0, 32), 'ticks': (-5000, 2**17), 'repeated': (0.0, 1.0),
     'event': (0, 5), 'event_deviation': (0.0, math.inf), 'past_place': (0, 511),
     'past_count': (0, 512),
 }  # fmt: skip

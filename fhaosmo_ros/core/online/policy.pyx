@@ -8,7 +8,7 @@ sample needs the inputs that arrived a lag of measurement_delay - input_delay be
 """
 
 from cpython.pythread cimport PyThread_get_thread_ident
-from libc.math cimport INFINITY, fabs, fmax, fmin, isfinite, isnan, rint
+from libc.math cimport INFINITY, fabs, fmin, isfinite, isnan
 from libc.string cimport memcpy
 
 from fhaosmo_ros.core.model.prediction cimport MOST_LEVELS
@@ -37,15 +37,10 @@ cdef double NANOSECONDS = 1e-9
 TIMES = 'nominal_period', 'max_gap', 'stuck_time', 'divergence_time', 'measurement_delay'
 # Room for so many different values of the inputs within the delay; older ones are forgotten.
 cdef int MOST_PIECES = 512
-# A step of y is a multiple of another one up to this, and up to rounding of y to 32 bits.
-cdef double MULTIPLE = 1e-4, SINGLE = 6e-7
-# After so many regular changes y's sensor holds its values; so many are remembered.
-cdef int ENOUGH_REGULAR = 4, MOST_REGULAR = 12
+# y's sensor holds its values if most of so many of late were repeated, until few are.
+cdef double CHANGES = 10.0, MOST = 0.75, FEW = 0.25
 # A y with noise may repeat itself so often in a row by chance, if it is a float of 32 bits.
 cdef int CHANCE_REPEATS = 2
-# Of late, less than this share of so many of its values were repeated, but for one: at the end of
-# a range it is always the same one.
-cdef double RARELY = 0.05, CHANGES = 50.0
 # Larger samples are rejected, larger states are lost: products of several stay finite.
 cdef double LIMIT = 1e60
 # So many samples in a row may be rejected by spike_gate.
@@ -144,12 +139,8 @@ cdef struct Sensor:
     long long seen  # time of the latest sample, used or not
     long long changed  # since when y is what it is
     long long repeats  # samples in a row that repeat the one before
-    long long held_for  # how many of them there usually are
-    long long regular  # evidence that it holds each value for so long
     double sample  # the latest y, used or not
-    double change  # by what it last differed from the one before
-    double repeated  # the y that has repeated itself last
-    double elsewhere  # share of values of late that repeat themselves, another one each
+    double repeated  # share of values of late that repeated themselves
 
 
 cdef class Policy:
@@ -267,21 +258,20 @@ cdef class Policy:
 
     cdef int judge(self, long long stamp, long long now, double y) noexcept nogil:
         """Return the flag that says why a sample is not used, whatever the observer is like."""
-        cdef bint stuck
+        cdef int word = 0
         if not fabs(y) <= LIMIT:  # also NaN
             return REJECTED_MEASUREMENT
         if stamp == 0 and not self.settings.nominal:
             self.counters.zero_stamps += 1
             return REJECTED_PERIOD
-        stuck = self.settings.stuck_time > 0 and self.stands_still(y, now)
-        if self.tuner is not None and not stuck:
-            if self.is_held(y, now):
-                return REPEATED
-            stuck = self.repeats_noise(y)
-        if stuck:
+        if self.settings.stuck_time > 0 and self.stands_still(y, now):
+            word = REJECTED_STUCK
+        elif self.tuner is not None:
+            word = self.repetition(y, now)
+        if word == REJECTED_STUCK:
             self.counters.stuck += not self.sensor.stuck
             self.sensor.stuck = True
-        return REJECTED_STUCK * stuck
+        return word
 
     # What a sample tells by itself: its time, and whether y can be true
 
@@ -295,57 +285,31 @@ cdef class Policy:
             sensor.changed, sensor.stuck = now, False
         return difference(now, sensor.changed) > self.settings.stuck_time
 
-    cdef bint is_held(self, double y, long long now) noexcept nogil:
+    cdef int repetition(self, double y, long long now) noexcept nogil:
         """
-        Return True if y repeats a value because its sensor holds it, being slower than the topic.
+        Return the flag of a y that repeats itself although it has noise, else 0.
 
-        Only for self-tuning, which would take every change after it for one of d. A sensor holds
-        values if they change after as many samples as before, about, and not by multiples, as an
-        encoder's counts do. Where y really stands still it repeats itself for longer.
+        Only self-tuning knows the noise. The sensor holds its values, being slower than the topic,
+        if most of them are repeated: each change would be taken for one of d. Else it is stuck, or
+        at the end of its range.
         """
         cdef Sensor* sensor = &self.sensor
-        cdef long long elapsed = difference(now, self.course.latest), usual = sensor.held_for
-        cdef double before = sensor.sample, change = y - before, low, high, others, elsewhere
-        if self.course.timed and elapsed <= 0:
-            return False  # a sample that comes twice is no repetition
-        sensor.sample = y
-        if change == 0.0:
-            sensor.repeats += 1
-            if sensor.repeats > 2 * usual + 1 or 2 * abs(elapsed) >= self.max_gap():
-                return False
-            return sensor.holds
-        low = fmin(fabs(change), fabs(sensor.change))
-        high = fmax(fabs(change), fabs(sensor.change))
-        others = high / low if low > 0.0 else 0.0
-        sensor.stuck, elsewhere = False, 0.0
-        if sensor.repeats > 0 and before != sensor.repeated:
-            elsewhere, sensor.repeated = 1.0, before
-        sensor.elsewhere += (elsewhere - sensor.elsewhere) / CHANGES
-        if sensor.repeats == 0 or 4 * abs(sensor.repeats - usual) > max(usual, 4):
-            sensor.regular = max(sensor.regular - 2, 0)
-        elif low > 0.0 and fabs(others - rint(others)) > MULTIPLE + SINGLE * fabs(y) / low:
-            sensor.regular = min(sensor.regular + 1, MOST_REGULAR)
-        if sensor.regular == 0:
-            sensor.held_for, sensor.holds = sensor.repeats, False
-        elif sensor.regular >= ENOUGH_REGULAR and not sensor.holds:
-            sensor.holds = True
-            self.tuner.begin_afresh()  # with the sensor's own period
-        sensor.repeats, sensor.change = 0, change
-        return False
-
-    cdef bint repeats_noise(self, double y) noexcept nogil:
-        """
-        Return True if y repeats itself although it has noise; after `is_held`.
-
-        The sensor is stuck then, or at the end of its range. Only self-tuning knows the noise.
-        """
-        cdef Sensor* sensor = &self.sensor
-        if sensor.repeats <= CHANCE_REPEATS or y != sensor.sample:
-            return False  # also of another y whose stamp is not later: `is_held` leaves that alone
-        return sensor.stuck or (
-            sensor.repeats == CHANCE_REPEATS + 1
-            and sensor.elsewhere < RARELY and self.tuner.is_noisy(y)
-        )
+        if self.course.timed and difference(now, self.course.latest) <= 0:
+            return 0  # a sample that comes twice is no repetition
+        if y != sensor.sample:
+            sensor.repeated += ((sensor.repeats > 0) - sensor.repeated) / CHANGES
+            if sensor.repeated > MOST and not sensor.holds and self.tuner.is_noisy(y):
+                sensor.holds = True
+                self.tuner.begin_afresh()  # with the sensor's own period
+            sensor.holds = sensor.holds and sensor.repeated > FEW
+            sensor.repeats, sensor.sample, sensor.stuck = 0, y, False
+            return 0
+        sensor.repeats += 1
+        if sensor.holds and 2 * difference(now, self.course.latest) < self.max_gap():
+            return REPEATED
+        if sensor.stuck or (sensor.repeats > CHANCE_REPEATS and self.tuner.is_noisy(y)):
+            return REJECTED_STUCK
+        return 0
 
     cdef bint is_spike(self, double innovation) noexcept nogil:
         """Return True if y is too far from its prediction to be believed yet."""

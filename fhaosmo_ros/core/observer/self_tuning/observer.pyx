@@ -18,8 +18,9 @@ from fhaosmo_ros.core.observer.self_tuning.members cimport (
     MOST_ORDER, MOST_STATES, Members, ORDERS, Sample, Shared, WINDOW, Work, entry, find_tuning, put
 )
 from fhaosmo_ros.core.observer.self_tuning.noise cimport (
-    APART, FADED, ROUNDED, STEADY, bound_of_noise, fill_noise, find_knowing, follow_differences,
-    follow_noise, follow_quantum, follow_stamps, is_even, is_likely, periods, rounding, usual_speed
+    APART, FADED, LATTICE_SHARE, ROUNDED, STEADY, bound_of_noise, fill_noise, find_knowing,
+    follow_differences, follow_noise, follow_quantum, follow_stamps, is_even, is_likely, periods,
+    rounding, usual_speed
 )
 from fhaosmo_ros.core.observer.self_tuning.start cimport gather
 from fhaosmo_ros.core.observer.self_tuning.weights cimport (
@@ -117,7 +118,8 @@ cdef class SelfTuning(Structure):
             rough = bound_of_noise(m, 0, p)
             if not rough > fmax(LEAST_NOISE * LEAST_NOISE * least, ROUNDED * y * (ROUNDED * y)):
                 return False
-        return m.shared.active == COUNT  # else y is quantised, or none has begun
+        # Else y is quantised, and may repeat itself by chance, or none has begun.
+        return m.shared.active == COUNT and m.shared.lattice < LATTICE_SHARE
 
     # What a structure implements
 
