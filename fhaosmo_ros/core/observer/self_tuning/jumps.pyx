@@ -21,8 +21,8 @@ from fhaosmo_ros.core.observer.structure cimport GATE, LOST_SAMPLES
 
 # Where unlikely samples are farther off than the first one, d may have jumped (D 33). Farther
 # means: so many times as far at least, and 3 sigma more; and so many times the highest differences
-# of y, which noise does not get to. Differences must not have been larger than usual before, unless
-# y is farther off by the last factor.
+# of y, which noise does not get to. Differences must not have been larger than usual before, but
+# where y is farther off by the last factor.
 cdef double FARTHER = 1.3, SMOOTH = 5.0, SMOOTHEST = 30.0
 # From one usual value to the opposite one d jumps by so many times its usual size.
 cdef double USUAL_JUMP = 2.0
