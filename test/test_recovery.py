@@ -16,8 +16,6 @@ from fhaosmo_ros.tools.tuning.tuner import stamps_of
 import numpy as np
 from observer_cases import remembered
 import pytest
-from scipy.optimize import brentq
-from scipy.stats import norm
 
 CONFIG = ROOT / 'config'
 FILES = [
@@ -222,27 +220,12 @@ def test_steady_covariance_solves_its_equation():
     assert_alike(phi @ (steady - np.outer(gain, steady[0])) @ phi.T + q, steady, 1e-8)
 
 
-def influences(noise):
-    """Return as how large innovations of usual size 1 count, and the limits after each (D 32)."""
-    p = {'structure': 'levant', 'scheme': 'predict_correct', 'correction_period': 1e-3}
-    levant = Observer(p).structure
-    return np.transpose([levant.bounded(b, 1.0) for b in noise])
-
-
-@pytest.mark.parametrize('contamination', [0.0, 0.01, 0.05, 0.1])
-def test_limit_is_hubers_for_the_share_of_outliers(contamination):
-    rng, count = np.random.default_rng(1), 30_000
-    noise = rng.standard_normal(count)
-    noise[rng.random(count) < contamination] *= 100.0
-    odds, limit = contamination / (1.0 - contamination), 2.0
-    if contamination:  # Huber 1964
-        limit = brentq(lambda c: 2.0 * (norm.pdf(c) / c - norm.sf(c)) - odds, 1.0, 2.0)
-    _, found = influences(noise)
-    assert np.mean(found[count // 3 :]) == pytest.approx(limit, abs=0.12)
-
-
-def test_innovations_that_stay_on_one_side_are_no_outliers():
-    counted, limits = influences(np.full(40, 4.0))
-    assert (counted[:20] < 2.1).all()
-    assert (counted[20:] == 4.0).all()
-    assert limits[-1] > 1.95
+def test_likely_sample_counts_as_two_usual_deviations_at_most():
+    """It is used as if it were that large; nearer ones count as they are."""
+    found = []
+    for size in (1.0, 3.0, 5.0):
+        observer = Observer.from_yaml(CONFIG / 'noise_1e-3.yaml')
+        observer.run(np.arange(3 * RATE) / RATE, np.zeros(3 * RATE))
+        found.append(observer.step(size * observer.parameters['noise_size'], 1.0 / RATE).z)
+    np.testing.assert_allclose(found[2], found[1], rtol=1e-12)
+    assert found[1][0] > 1.5 * found[0][0]

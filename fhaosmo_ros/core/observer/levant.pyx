@@ -9,7 +9,7 @@ z_hat_{i+1}, so that whatever reads a cascade's state reads this one; theta is 0
 Levant 2003, doi:10.1080/0020717031000099029.
 """
 
-from libc.math cimport INFINITY, M_2_PI, copysign, erfc, exp, fabs, log, log1p, pow, sqrt
+from libc.math cimport INFINITY, copysign, exp, fabs, log, log1p, pow, sqrt
 from libc.string cimport memcpy
 
 from fhaosmo_ros.core.model.phi cimport Dual
@@ -31,14 +31,6 @@ cdef double CLOSE = 0.02
 cdef double NEARLY_STEADY = 1.5
 # So many samples in a row beyond all half-widths widen them.
 cdef double SATURATED_SAMPLES = 20.0
-# Innovations of more standard deviations count as so many, at least (D 32).
-cdef double LEAST_HUBER = 1.0
-# The share within the largest limit if the noise is normal: with it the gains are the tuned ones.
-cdef double WITHIN = 0.9465
-# Standard deviations by which the limit follows one sample.
-cdef double NARROWING = 0.01
-# More samples in a row beyond the limit on the same side are no outliers (D 32).
-cdef double ISOLATED = 20.0
 # A jump of y contradicts the model if it changes a Phi by more than this part of its size.
 cdef double OF_SIZE = 0.25
 
@@ -47,12 +39,6 @@ cdef struct Root:
     double eps  # |eps| >= 0
     double w  # |eps|^(2 gamma / N)
     double s  # of the last level, which is set-valued for sign
-
-
-cdef inline double beyond(double c) noexcept nogil:
-    """Return the share of samples beyond c where c is Huber's minimax limit (D 32)."""
-    cdef double q = sqrt(M_2_PI) * exp(-0.5 * c * c) / c
-    return q / (1.0 + q - erfc(c / sqrt(2.0)))
 
 
 cdef class Levant(SlidingMode):
@@ -88,8 +74,7 @@ cdef class Levant(SlidingMode):
     cdef void restart(self, double y) noexcept nogil:
         cdef Memory* memory = &self.memory
         SlidingMode.restart(self, y)
-        memory.saturated = memory.beyond = memory.offset = memory.watched = 0.0
-        memory.drift = memory.one_sided = 0.0
+        memory.saturated = memory.beyond = memory.offset = memory.watched = memory.drift = 0.0
         memory.scale = 1.0
 
     cdef void follow(self, double y, double h, const double* u) noexcept nogil:
@@ -98,7 +83,7 @@ cdef class Levant(SlidingMode):
         cdef Row* p = self.trial_covariance
         cdef int i, n = self.levels
         cdef double period = self.correction_period, variance = self.steady_variance, doubt = 1.0
-        cdef double b, change, moved, late = 0.0, usual, largest = 1.0
+        cdef double b, change, moved, late = 0.0, most, largest = 1.0
         cdef bint far, holds = memory.settled > 0.0 and fabs(h - period) <= NEAR * period
         cdef bint scheduling = self.scheduled and not holds
         if scheduling:
@@ -122,9 +107,9 @@ cdef class Levant(SlidingMode):
         if memory.beyond == 0.0:
             moved = self.level[0].z_hat - self.before[0].z_hat
             late = fabs(moved / h * change)
-        usual = follow_spread(memory, b, sqrt(variance), late)
+        most = HUBER * follow_spread(memory, b, sqrt(variance), late)
         if variance < NEARLY_STEADY * self.steady_variance:  # a large P counts on all of b
-            y = self.level[0].z_hat + self.influence(b, usual)
+            y = self.level[0].z_hat + min(max(b, -most), most)
         if memory.beyond > 0.0:
             return
         if scheduling:
@@ -229,31 +214,6 @@ cdef class Levant(SlidingMode):
             memory.saturated = 0.0
             memory.scale = 1.0 + (memory.scale - 1.0) / (1.0 + h * self.relaxation)
 
-    cdef double influence(self, double b, double usual) noexcept nogil:
-        """
-        Return as how large an innovation counts (D 32), and let its limit follow the noise.
-
-        Only the first of several in a row beyond the limit on one side tells of outliers.
-        """
-        cdef Memory* memory = &self.memory
-        cdef double c = HUBER - memory.narrowed, far = 0.0, share, narrowed, first
-        if fabs(b) <= c * usual:
-            memory.one_sided = memory.first_miss = 0.0
-        elif b * memory.one_sided > 0.0:
-            memory.one_sided += copysign(1.0, b)
-        else:
-            memory.one_sided = copysign(1.0, b)
-            far = 1.0
-        share = beyond(c)
-        narrowed = memory.narrowed + NARROWING * (far - share * (1.0 - 0.5 * share))
-        memory.narrowed = min(max(narrowed, 0.0), HUBER - LEAST_HUBER)
-        if fabs(memory.one_sided) > ISOLATED:
-            first = memory.first_miss  # 0 if none was too far off
-            if first * (2.0 * b - first) > 0.0:  # y is lost
-                memory.beyond, memory.miss = max(memory.beyond, ISOLATED + 1.0), b
-            return b
-        return min(max(b, -c * usual), c * usual) * WITHIN / (1.0 - share)
-
     cdef double innovation_variance(self) noexcept nogil:
         return self.trial_covariance[0][0] + self.noise_variance
 
@@ -275,7 +235,3 @@ cdef class Levant(SlidingMode):
             p[0][i] = p[i][0] = 0.0
         p[0][0] = memory.miss * memory.miss
         memcpy(self.covariance, p, n * sizeof(Row))
-
-    def bounded(self, double b, double usual):
-        """Return as how large an innovation counts, and the limit after it over `usual` (D 32)."""
-        return self.influence(b, usual), HUBER - self.memory.narrowed

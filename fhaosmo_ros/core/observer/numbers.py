@@ -18,8 +18,8 @@ COUNTS = 0, 2**62
 YES_OR_NO = 0, 1
 FINITE, NOT_NEGATIVE, AT_LEAST_1 = (-LARGEST, LARGEST), (0.0, LARGEST), (1.0, LARGEST)
 RANGES: dict[str, tuple[float, float]] = {
-    **dict.fromkeys(('pending', 'period', 'interval', 'since', 'watched'), NOT_NEGATIVE),
-    **dict.fromkeys(('saturated', 'narrowed'), NOT_NEGATIVE),
+    **dict.fromkeys(('pending', 'period', 'interval', 'since'), NOT_NEGATIVE),
+    **dict.fromkeys(('watched', 'saturated'), NOT_NEGATIVE),
     'beyond': (0.0, math.inf),
     **dict.fromkeys(('spread', 'scale'), AT_LEAST_1),
     **dict.fromkeys(('spikes', 'tick_count', 'repeats'), COUNTS),

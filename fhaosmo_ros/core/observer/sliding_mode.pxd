@@ -14,7 +14,7 @@ cdef int NEWTON_STEPS
 cdef double NEWTON_TOLERANCE
 # Innovations below this are taken for 0: their powers would underflow.
 cdef double TINY
-# Innovations of more standard deviations count as so many, at most (D 32).
+# Innovations of more standard deviations count as so many (Huber 1964).
 cdef double HUBER
 
 

@@ -45,8 +45,6 @@ cdef struct Memory:
     double scale  # factor s of the half-widths and of the injections (D 22)
     double saturated  # samples in a row with |eps_1| beyond all half-widths (D 22)
     double settled  # 1: the gains are the tuned ones; else minus the time since the start (D 20)
-    double narrowed  # by what the limit of the influence of innovations is below HUBER (D 32)
-    double one_sided  # samples in a row beyond that limit on one side; < 0 on the lower (D 32)
     # What those remember that judge samples.
     double interval  # the last one between two samples, likely or not (s); 0: none yet
     double since  # time from the last sample that was used to the last one (s)

@@ -297,7 +297,7 @@ cdef class Structure:
             self.level[0].z_hat += offset
             memory.y += offset
         self.go_on_after_jump(self.level[0].z_hat - predicted)
-        memory.beyond = memory.drift = memory.one_sided = 0.0
+        memory.beyond = memory.drift = 0.0
         memory.watched = WATCH
         return True
 
