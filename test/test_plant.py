@@ -87,14 +87,15 @@ def test_known_input_acts_during_the_interval_that_ends_at_its_time():
 def test_live_change_acts_from_now_on():
     plant = Plant(REST | {'initial_state': 0.0})
     plant.advance(1.0)
-    plant.configure({'disturbance': 'step', 'disturbance_amplitude': 2, 'disturbance_start': 0})
+    step = {'disturbance': 'step', 'disturbance_amplitude': 2, 'disturbance_start': 0}
+    plant.adopt(plant.prepare(step), noise_anew=False)
     truth = plant.sample(2.0)
     # A change may act from the last point of the grid on, one integration step earlier.
     np.testing.assert_allclose(truth.z, [2.0], atol=2.0 * plant.parameters['integration_step'])
     assert truth.unknown_input == 2.0
     noise = Plant(REST | {'noise_std': 1.0})
     first = [noise.sample(t).y for t in (0.1, 0.2, 0.3)]
-    noise.configure({'noise_seed': 1})  # begins the noise again
+    noise.adopt(noise.parameters, noise_anew=True)
     np.testing.assert_array_equal([noise.sample(t).y for t in (0.4, 0.5, 0.6)], first)
 
 
@@ -102,7 +103,7 @@ def test_refused_change_or_time_changes_nothing():
     plant = Plant()
     for change in {'noise_std': -1.0}, {'nois_std': 1.0}, {'initial_state': [9.0]}:
         with pytest.raises(ConfigurationError, match=next(iter(change))):
-            plant.configure({'disturbance_amplitude': 9.0} | change)
+            plant.prepare({'disturbance_amplitude': 9.0} | change)
     for t in np.nan, np.inf, -np.inf:
         for call in (plant.advance, plant.sample, lambda t: plant.simulate([0.0, t])):
             with pytest.raises(ConfigurationError, match='expected finite time'):

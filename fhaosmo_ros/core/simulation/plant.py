@@ -55,9 +55,9 @@ class Plant:
         self._system = System(self.model.expressions, self._d, p['integration_step'], z)
         self._random = np.random.default_rng(p['noise_seed'])
 
-    def configure(self, changes: Mapping[str, Any]) -> None:
+    def prepare(self, changes: Mapping[str, Any]) -> Parameters:
         """
-        Change live parameters from now on; all or nothing.
+        Return what `adopt` takes for these changes; nothing has changed yet.
 
         Raises
         ------
@@ -65,10 +65,6 @@ class Plant:
             An unknown name, a bad value, or a parameter that can't change live.
 
         """
-        self.adopt(self.prepare(changes), 'noise_seed' in changes)
-
-    def prepare(self, changes: Mapping[str, Any]) -> Parameters:
-        """Return what `adopt` takes for these changes; raise as `configure`, change nothing."""
         parameters = self.parameters.changed_live(changes, 'plant')
         TriangularModel.of(parameters)  # raises where it can't be used with other constants
         return parameters
