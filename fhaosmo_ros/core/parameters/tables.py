@@ -241,7 +241,7 @@ ESTIMATOR_NODE = (
 PLANT_MODEL = (
     Parameter('initial_state', [0.2], 'States z_1 .. z_n at the start.', lower=-1e12, upper=1e12,
               live=False, lengths='1 or n'),
-    Parameter('integration_step', 1e-4, 'Step of the Runge-Kutta integration.', unit='s',
+    Parameter('integration_step', 1e-4, 'Longest step of the Runge-Kutta integration.', unit='s',
               lower=1e-6, upper=0.1, live=False),
     Parameter('disturbance', 'sine',
               'The unknown input d(t): none (0), sine (amplitude sin(omega t) + offset), step '

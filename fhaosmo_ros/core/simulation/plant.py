@@ -172,9 +172,9 @@ def respond(
     `t` (K,) are the times (s), not decreasing, from 0 on; `table` (M,) has d at 0, `spacing`,
     2 `spacing`, .. (s), M >= 2, it is linear in between and constant behind the end; `u`, a
     number, (K,) or (K, m), is held during the interval that ends at each time. No step is longer
-    than `step` (s); each interval is divided evenly.
+    than `step` (s).
     """
     d, z = Disturbance({}, table, spacing), np.broadcast_to(initial_state, model.order)
     inputs = known_inputs(u, model.inputs, np.size(t))
-    states = System(model.expressions, d, step, z).advance(t, inputs, on_grid=False)
+    states = System(model.expressions, d, step, z).advance(t, inputs)
     return states, d.along(t)

@@ -22,11 +22,9 @@ cdef class Disturbance:
 cdef class System(Dynamics):
     cdef Expressions phi
     cdef Disturbance d
-    cdef double h  # step of the grid of time (s)
+    cdef double h  # longest step (s)
     cdef const double* u  # known inputs of the present interval
     cdef const double[::1] held  # and of the latest one
-    cdef long long taken  # steps of the grid since t = 0
-    cdef double on_grid[MOST_LEVELS]  # z_1 .. z_n then, at taken * h
-    cdef double z[MOST_LEVELS]  # and at the time of the latest `advance`
-    cdef void go_to(self, double t, const double* u) noexcept nogil
-    cdef void go_evenly(self, double begin, double t, const double* u) noexcept nogil
+    cdef double t  # time that it has come to (s)
+    cdef double z[MOST_LEVELS]  # z_1 .. z_n then
+    cdef void go_to(self, double t) noexcept nogil

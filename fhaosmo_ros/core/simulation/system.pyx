@@ -73,7 +73,7 @@ cdef class System(Dynamics):
     """
     A triangular system that d drives, integrated by the classical Runge-Kutta method.
 
-    `phi` are Phi_1 .. Phi_n, `h` is the step (s), and `z`, (n,), are the states at t = 0.
+    `phi` are Phi_1 .. Phi_n, `h` is the longest step (s), and `z`, (n,), are the states at t = 0.
     """
 
     def __cinit__(self, Expressions phi not None, Disturbance d not None, double h, z):
@@ -84,7 +84,7 @@ cdef class System(Dynamics):
         self.phi, self.d = phi, d
         self.held = np.zeros(max(phi.inputs, 1))
         for i in range(self.size):
-            self.on_grid[i] = self.z[i] = z[i]
+            self.z[i] = z[i]
 
     def change(self, Expressions phi not None, Disturbance d not None):
         """Go on with other functions of as many states and known inputs."""
@@ -104,37 +104,24 @@ cdef class System(Dynamics):
             slope[i] = x[i + 1] if i < last else self.d.at(t)
             slope[i] += evaluate(self.phi, i, x, STILL, self.u).value
 
-    cdef void go_to(self, double t, const double* u) noexcept nogil:
-        """
-        Bring `z` to the time `t`.
-
-        Only whole steps of the grid change `on_grid`; the rest of the way to `t` is taken on a
-        copy, so that the trajectory doesn't depend on the times at which somebody looks.
-        """
-        self.u = u
-        while (self.taken + 1) * self.h <= t:
-            take_step(self, &CLASSICAL, self.taken * self.h, self.h, self.on_grid)
-            self.taken += 1
-        memcpy(self.z, self.on_grid, sizeof(self.z))
-        if t > self.taken * self.h:
-            take_step(self, &CLASSICAL, self.taken * self.h, t - self.taken * self.h, self.z)
-
-    cdef void go_evenly(self, double begin, double t, const double* u) noexcept nogil:
-        """Bring `z` from the time `begin` to `t` in equal steps, off the grid."""
-        cdef long long j, count = <long long>fmax(ceil((t - begin) / self.h - 1e-9), 1.0)
-        cdef double step = (t - begin) / count
-        self.u = u
-        for j in range(count if step > 0.0 else 0):
+    cdef void go_to(self, double t) noexcept nogil:
+        """Bring `z` to `t` in equal steps of at most `h`; one that has passed is left out."""
+        cdef double begin = self.t, step
+        cdef long long j, count
+        if not t > begin:
+            return
+        count = <long long>fmax(ceil((t - begin) / self.h - 1e-9), 1.0)
+        step = (t - begin) / count
+        self.u, self.t = &self.held[0], t
+        for j in range(count):
             take_step(self, &CLASSICAL, begin + j * step, step, self.z)
 
-    def advance(self, t, u, bint on_grid=True):
+    def advance(self, t, u):
         """
         Return the states at many times, (K, n).
 
         `t`, (K,) or a number, are times since t = 0 (s), finite and not decreasing; `u`, (K, m),
-        are the known inputs of the interval that ends at each. Steps lie on the grid of time;
-        else, for a run from t = 0 on, each interval is divided evenly, so that a step has one
-        value of each known input.
+        are the known inputs of the interval that ends at each: a step has one value of each.
         """
         cdef const double[::1] times = np.ascontiguousarray(t, dtype=np.float64)
         cdef const double[:, ::1] inputs = u
@@ -147,15 +134,12 @@ cdef class System(Dynamics):
         if not (np.isfinite(times).all() and (np.diff(times) >= 0.0).all()):
             raise ConfigurationError('plant: expected finite times that rise or stay, got others')
         for k in range(count):
-            if on_grid:
-                self.go_to(times[k], &inputs[k, 0])
-            else:
-                self.go_evenly(times[k - 1] if k > 0 else 0.0, times[k], &inputs[k, 0])
-            memcpy(&states[k, 0], self.z, self.size * sizeof(double))
             self.held = inputs[k]
+            self.go_to(times[k])
+            memcpy(&states[k, 0], self.z, self.size * sizeof(double))
         return np.asarray(states)
 
     def go_on(self, double t):
         """Return z_1 at `t`, with the known inputs of the latest `advance`; in a microsecond."""
-        self.go_to(t, &self.held[0])
+        self.go_to(t)
         return self.z[0]
