@@ -80,8 +80,7 @@ class ReportLog:
     def tell(self, reports: Iterable[Report]) -> None:
         """Log what is new in the present reports."""
         now, log = monotonic(), self._node.get_logger()
-        quiet = max(QUIET, 2.0 * self._node.values['diagnostics_period'])
-        self._found = {kind: at for kind, at in self._found.items() if now - at < quiet}
+        self._found = {kind: at for kind, at in self._found.items() if now - at < QUIET}
         for report in reports:
             for level, finding in report.findings:
                 if level == OK or (now < self._begun and level != ERROR):
