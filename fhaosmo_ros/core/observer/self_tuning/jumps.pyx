@@ -30,7 +30,7 @@ cdef double USUAL_JUMP = 2.0
 
 cdef void begin_growth(Members* m) noexcept nogil:
     """Take the first of the unlikely samples in a row."""
-    m.shared.first_off, m.shared.first_h = fabs(m.work.sample.off), m.work.sample.h
+    m.shared.first_off, m.shared.first_off_after = fabs(m.work.sample.off), m.work.sample.h
     m.shared.uneven, m.shared.first_rough = m.work.sample.uneven, m.work.sample.roughness_before
 
 
@@ -44,7 +44,7 @@ cdef double farther(Members* m) noexcept nogil:
     """
     cdef Shared* shared = &m.shared
     cdef double hidden = fmin(GATE * sqrt(m.work.now[0]) / shared.first_off, 1.0)
-    cdef double later = m.work.sample.h / shared.first_h - 1.0
+    cdef double later = m.work.sample.h / shared.first_off_after - 1.0
     return fmax(FARTHER, power(1.0 + later * (1.0 - pow(hidden, 1.0 / m.n)), m.n - 1))
 
 

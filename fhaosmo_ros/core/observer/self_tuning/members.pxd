@@ -111,8 +111,8 @@ cdef struct Shared:
     double far_sign  # sign of the last innovation that was too far off for every member
     double growing  # unlikely samples in a row that are farther and farther off (D 33)
     double size_of_d  # mean square of d of late, by its estimates and their variances
-    double first_h  # time from the last likely sample to the first unlikely one in a row (s)
     double first_off  # how far off the first of the unlikely samples in a row was
+    double first_off_after  # time until then from the last likely sample (s)
     double uneven  # mean square of the highest difference of y in these samples
     double first_rough  # what `roughness` was before the first of them
     double recent  # samples left that count as part of a jump of d (D 33)
