@@ -263,6 +263,17 @@ def test_a_moving_y_that_freezes_is_no_jump_of_d(order, noise):
     assert np.abs(found - d).max() < 1.5 * np.abs(d).max()
 
 
+@pytest.mark.parametrize('seed', range(8))
+def test_a_y_without_noise_that_is_zero_for_some_samples_is_no_jump_of_d(seed):
+    rng = np.random.default_rng(seed)
+    d = matern(8_000, 3.0, 1, rng)
+    y = states_of(np.array([[0.0, 1.0], [0.0, -5.0]]), d, [0.2, 0.2])[:, 0]
+    for begin in range(3_000, len(y), 700):
+        y[begin : begin + rng.integers(1, 40)] = 0.0
+    found = Observer(MOTOR, phi=['0', '-5*z2']).run(np.arange(len(y)) * PERIOD, y).unknown_input
+    assert np.abs(found - d).max() < 1.5 * np.abs(d).max()
+
+
 @pytest.mark.parametrize('counts', [1024, 4096, 65536])
 def test_slow_motion_over_an_encoder(counts):
     """It stands still for most of the time; a count that comes then is no jump of d."""

@@ -34,18 +34,19 @@ cdef void begin_growth(Members* m) noexcept nogil:
     m.shared.uneven, m.shared.first_rough = m.work.sample.uneven, m.work.sample.roughness_before
 
 
-cdef double farther(Members* m) noexcept nogil:
+cdef double growth(Members* m) noexcept nogil:
     """
-    Return by what factor y has to be farther off than at the first unlikely sample (D 33).
+    Return by what factor y is farther off than at the sample before, at least, after a jump of d.
 
-    A jump of d puts y off by tau^n, and a short d by tau^(n - 1), in a time tau that begins after
-    the last sample that was likely, when it was within the gate. A y that freezes while it moves
-    is off by tau: no jump of d, unless n is 2.
+    A jump of d puts y off by tau^n, and a blow by tau^(n - 1), in a time tau that begins after the
+    last sample that was likely, when y was within the gate (D 33). A y that freezes while it moves
+    is off by tau, and one that has an offset by the same all the time.
     """
     cdef Shared* shared = &m.shared
-    cdef double hidden = fmin(GATE * sqrt(m.work.now[0]) / shared.first_off, 1.0)
-    cdef double later = m.work.sample.h / shared.first_off_after - 1.0
-    return fmax(FARTHER, power(1.0 + later * (1.0 - pow(hidden, 1.0 / m.n)), m.n - 1))
+    cdef double gate = fmin(GATE * sqrt(m.work.now[0]) / shared.first_off, 1.0)
+    cdef double hidden = pow(gate, 1.0 / m.n), first = shared.first_off_after
+    cdef double now = m.work.sample.h, before = shared.latest_off_after
+    return power((now + hidden * (first - now)) / (before + hidden * (first - before)), m.n - 1)
 
 
 cdef bint has_jumped(Members* m, double beyond) noexcept nogil:
@@ -59,18 +60,19 @@ cdef bint has_jumped(Members* m, double beyond) noexcept nogil:
     """
     cdef Shared* shared = &m.shared
     cdef Sample* sample = &m.work.sample
-    cdef double off = fabs(sample.off), uneven, hidden, jump
+    cdef double off = fabs(sample.off), uneven, hidden, jump, noise, least
     cdef int count = <int>fmin(beyond, LOST_SAMPLES)
     if count == 0:
         begin_growth(m)
     shared.uneven += (sample.uneven - shared.uneven) / (count + 1.0)
     uneven = sqrt(shared.uneven)
-    if count > 0 and off > SMOOTH * uneven and (
-        off > farther(m) * shared.first_off + HUBER * sqrt(m.work.now[0])
-    ):
+    noise = HUBER * sqrt(m.work.now[0])
+    least = fmax(FARTHER * shared.first_off + noise, growth(m) * shared.latest_off - noise)
+    if count > 0 and off > fmax(SMOOTH * uneven, least):
         shared.growing += 1.0
     else:
         shared.growing = 0.0
+    shared.latest_off, shared.latest_off_after = off, sample.h
     if shared.growing == 0.0 or (
         shared.first_rough >= ROUGH and off <= SMOOTHEST * uneven
     ):

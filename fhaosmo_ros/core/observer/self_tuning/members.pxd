@@ -113,6 +113,8 @@ cdef struct Shared:
     double size_of_d  # mean square of d of late, by its estimates and their variances
     double first_off  # how far off the first of the unlikely samples in a row was
     double first_off_after  # time until then from the last likely sample (s)
+    double latest_off  # how far off the latest sample was
+    double latest_off_after  # time until then from the last likely sample before it (s)
     double uneven  # mean square of the highest difference of y in these samples
     double first_rough  # what `roughness` was before the first of them
     double recent  # samples left that count as part of a jump of d (D 33)

@@ -252,9 +252,12 @@ cdef class SelfTuning(Structure):
         expected = w.believed[shared.likeliest] * w.noise[shared.likeliest]
         shared.recent = fmax(shared.recent - 1.0, 0.0)
         begins = begins and not likely
-        # After a jump y moves less smoothly than before, but farther than noise would put it off.
+        # After a jump y moves less smoothly than before, but farther than noise would put it off;
+        # behind a sample that was passed over it is off for another reason.
         smooth = fabs(sample.off) > SMOOTHEST * sqrt(sample.uneven)
-        jumped = begins or (shared.recent > 0.0 and (smooth or not rough))
+        jumped = begins or (
+            shared.recent > 0.0 and memory.beyond == 0.0 and (smooth or not rough)
+        )
         if not likely and not jumped:
             self.pass_over()
             self.trial_variances[0] = expected
