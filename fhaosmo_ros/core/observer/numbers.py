@@ -19,12 +19,12 @@ YES_OR_NO = 0, 1
 FINITE, NOT_NEGATIVE, AT_LEAST_1 = (-LARGEST, LARGEST), (0.0, LARGEST), (1.0, LARGEST)
 RANGES: dict[str, tuple[float, float]] = {
     **dict.fromkeys(('pending', 'period', 'interval', 'since'), NOT_NEGATIVE),
-    **dict.fromkeys(('watched', 'saturated'), NOT_NEGATIVE),
+    **dict.fromkeys(('watched', 'saturated', 'spacing'), NOT_NEGATIVE),
     'beyond': (0.0, math.inf),
     **dict.fromkeys(('spread', 'scale'), AT_LEAST_1),
     **dict.fromkeys(('spikes', 'tick_count', 'repeats'), COUNTS),
     **dict.fromkeys(('mean_interval', 'longest_mean'), COUNTS),
-    'intervals': (0, 32), 'ticks': (-5000, 2**17), 'repeated': (0.0, 1.0),
+    'intervals': (0, 32), 'ticks': (0, 256), 'repeated': (0.0, 1.0),
     'event': (0, 5), 'event_deviation': (0.0, math.inf), 'past_place': (0, 511),
     'past_count': (0, 512),
 }  # fmt: skip

@@ -18,12 +18,13 @@ from fhaosmo_ros.core.observer.status cimport (
     REJECTED_SPIKE, REJECTED_STEP, REJECTED_STUCK, REPEATED, RESTARTED, UNUSED
 )
 from fhaosmo_ros.core.observer.structure cimport Estimate, Memory, MOST_INPUTS, Record, Structure
-from fhaosmo_ros.core.online.clock cimport FAR, WINDOW, Clock, clock_time, difference
+from fhaosmo_ros.core.online.clock cimport FAR, Clock, clock_time, difference
 
 from collections import namedtuple
 
 import numpy as np
 
+cdef int WINDOW = 32  # intervals that the running mean remembers
 # An interval of more mean intervals than this is a gap.
 cdef double GAP_RATIO = 2.0
 # Bounds what one sample may cost: a few milliseconds.
@@ -628,7 +629,7 @@ cdef class Policy:
         self.refresh()
         self.course.past_count = 0
         self.course.valid = False
-        self.clock.tick_count = self.clock.spacing = 0
+        self.clock.tick_count = 0
 
     @property
     def memory(self):
