@@ -89,13 +89,14 @@ cdef class Structure:
     # For a structure to implement.
     cdef void advance(self, double y, double h, const double* u) noexcept nogil
     cdef int accept(self, double y, double h) noexcept nogil
-    cdef void fail(self, double y) noexcept nogil
     cdef void restart(self, double y) noexcept nogil
     cdef double innovation_variance(self) noexcept nogil
     cdef double most_change(self, int i) noexcept nogil
     cdef void go_on_after_jump(self, double of_state) noexcept nogil
     cdef double variance(self, int i) noexcept nogil
     cdef void tell(self, double* model, double* tuning) noexcept nogil
+    cdef bint is_noisy(self, double y) noexcept nogil
+    cdef void begin_afresh(self) noexcept nogil
     cdef bint jump(self, const double* u) noexcept nogil
 
 

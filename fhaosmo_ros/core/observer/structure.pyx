@@ -139,7 +139,7 @@ cdef class Structure:
                 memory.pending = memory.behind = 0.0
                 if not self.implicit:
                     memory.y = y
-                self.fail(y)
+                self.begin_afresh()
             elif memory.beyond > LOST_SAMPLES and self.jump(u):
                 memory.pending = elapsed
                 word = REJECTED_SPIKE | JUMPED
@@ -228,9 +228,6 @@ cdef class Structure:
         """Keep what a step has made; return status flags."""
         return 0
 
-    cdef void fail(self, double y) noexcept nogil:
-        """Forget what may have made a step leave the finite numbers."""
-
     cdef void restart(self, double y) noexcept nogil:
         """Begin afresh from `y`; the time of the next sample counts from it."""
 
@@ -254,6 +251,13 @@ cdef class Structure:
         cdef int i
         for i in range(7):
             tuning[i] = NAN
+
+    cdef bint is_noisy(self, double y) noexcept nogil:
+        """Return True if y has noise, so that it does not repeat itself."""
+        return False
+
+    cdef void begin_afresh(self) noexcept nogil:
+        """Forget what has been found of y: it may have made a step leave the finite numbers."""
 
     cdef bint jump(self, const double* u) noexcept nogil:
         """

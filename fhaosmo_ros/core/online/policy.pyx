@@ -12,7 +12,6 @@ from libc.math cimport INFINITY, fabs, fmin, isfinite, isnan
 from libc.string cimport memcpy
 
 from fhaosmo_ros.core.model.prediction cimport MOST_LEVELS
-from fhaosmo_ros.core.observer.self_tuning.observer cimport SelfTuning
 from fhaosmo_ros.core.observer.status cimport (
     DIVERGED, FLAGS_MASK, GAP, HELD, JUMPED, REJECTED, REJECTED_MEASUREMENT, REJECTED_PERIOD,
     REJECTED_SPIKE, REJECTED_STEP, REJECTED_STUCK, REPEATED, RESTARTED, UNUSED
@@ -52,6 +51,7 @@ cdef struct Settings:
     bint nominal  # dt is `nominal_period`, whatever the stamps say
     bint by_clock  # stamps are the node clock's at reception
     bint to_now  # estimates are carried over the delay, which is not 0
+    bint tunes  # the observer is self-tuning: only this one knows whether y has noise
     long long nominal_period
     long long max_gap  # 0: MOST_INTERVALS usual ones
     long long stuck_time  # 0: off
@@ -152,7 +152,6 @@ cdef class Policy:
     """
 
     cdef readonly Structure structure  # the observer
-    cdef SelfTuning tuner  # the same, where it is self-tuning, else None
     cdef object parameters
     cdef Settings settings
     cdef public Counts counters
@@ -183,13 +182,12 @@ cdef class Policy:
         if self.parameters is not None and self.parameters['sampling'] != p['sampling']:
             self.course.timed, self.clock.tick_count = False, 0  # stamps of another clock
         self.structure, self.parameters = structure, parameters
-        self.tuner = structure if isinstance(structure, SelfTuning) else None
         times = {name: p[name] for name in TIMES}
         times['lag'] = (late - p['input_delay']) * bool(c.model.used_inputs)
         self.settings = {name: round(t / NANOSECONDS) for name, t in times.items()} | {
             'nominal': p['sampling'] == 'nominal', 'by_clock': p['sampling'] == 'clock',
-            'to_now': p['predict_to_now'] and late > 0.0, 'gate': p['spike_gate'],
-            'epsilon': INFINITY if knows_noise else p['epsilon'],
+            'to_now': p['predict_to_now'] and late > 0.0, 'tunes': c.self_tuning,
+            'gate': p['spike_gate'], 'epsilon': INFINITY if knows_noise else p['epsilon'],
         }
 
     def __enter__(self):
@@ -267,7 +265,7 @@ cdef class Policy:
             return REJECTED_PERIOD
         if self.settings.stuck_time > 0 and self.stands_still(y, now):
             word = REJECTED_STUCK
-        elif self.tuner is not None:
+        elif self.settings.tunes:
             word = self.repetition(y, now)
         if word == REJECTED_STUCK:
             self.counters.stuck += not self.sensor.stuck
@@ -290,25 +288,24 @@ cdef class Policy:
         """
         Return the flag of a y that repeats itself although it has noise, else 0.
 
-        Only self-tuning knows the noise. The sensor holds its values, being slower than the topic,
-        if most of them are repeated: each change would be taken for one of d. Else it is stuck, or
-        at the end of its range.
+        The sensor holds its values, being slower than the topic, if most of them are repeated:
+        each change would be taken for one of d. Else it is stuck, or at the end of its range.
         """
         cdef Sensor* sensor = &self.sensor
         if self.course.timed and difference(now, self.course.latest) <= 0:
             return 0  # a sample that comes twice is no repetition
         if y != sensor.sample:
             sensor.repeated += ((sensor.repeats > 0) - sensor.repeated) / CHANGES
-            if sensor.repeated > MOST and not sensor.holds and self.tuner.is_noisy(y):
+            if sensor.repeated > MOST and not sensor.holds and self.structure.is_noisy(y):
                 sensor.holds = True
-                self.tuner.begin_afresh()  # with the sensor's own period
+                self.structure.begin_afresh()  # with the sensor's own period
             sensor.holds = sensor.holds and sensor.repeated > FEW
             sensor.repeats, sensor.sample, sensor.stuck = 0, y, False
             return 0
         sensor.repeats += 1
         if sensor.holds and 2 * difference(now, self.course.latest) < self.max_gap():
             return REPEATED
-        if sensor.stuck or (sensor.repeats > CHANCE_REPEATS and self.tuner.is_noisy(y)):
+        if sensor.stuck or (sensor.repeats > CHANCE_REPEATS and self.structure.is_noisy(y)):
             return REJECTED_STUCK
         return 0
 

@@ -5,6 +5,7 @@ from libc.math cimport INFINITY, NAN, copysign, exp, fabs, fmax, fmin, log, pow,
 from libc.stdlib cimport calloc, free
 from libc.string cimport memcpy, memset
 
+from fhaosmo_ros.core.model.prediction cimport MOST_LEVELS
 from fhaosmo_ros.core.observer.self_tuning.filters cimport (
     EXACT, HUBER, allow_jump, correct, correct_states, expect, predict_states
 )
@@ -71,6 +72,18 @@ cdef class SelfTuning(Structure):
 
     """
 
+    # What the parameters say.
+    cdef bint is_linear  # the model
+    # What it remembers.
+    cdef void* block  # of memory, which holds the members
+    cdef Members* members
+    cdef Model model  # the likeliest model of d, which a smoother goes by (D 34)
+    cdef double variances[MOST_LEVELS]  # of the errors of z, d, ..; infinite before it begins
+    cdef bint y_jumped  # a sample tells that y has jumped (D 35)
+    # A step's own.
+    cdef Model trial_model
+    cdef double trial_variances[MOST_LEVELS]
+
     def __cinit__(self, configuration):
         if self.order > MOST_ORDER:
             raise ConfigurationError(
@@ -104,10 +117,6 @@ cdef class SelfTuning(Structure):
         """Let the members begin afresh, by the next samples."""
         memset(&self.members.shared, 0, sizeof(Shared))
         self.memory.beyond = 0.0
-
-    cdef void fail(self, double y) noexcept nogil:
-        """Let the members begin afresh after a step that has left the finite numbers."""
-        self.begin_afresh()
 
     cdef bint is_noisy(self, double y) noexcept nogil:
         """Return True if all differences of y show noise, so that it does not repeat itself."""
