@@ -3,7 +3,7 @@
 The Kalman filter of a triangular model with a chain of integrators that makes d (D 17, D 20).
 
 For the scheduled gains, the smoother and the identification of a recording. The self-tuning
-observer has the same formulas with one more index (self_tuning/filters.pyx).
+observer has the same formulas with one more index (self_tuning/members.pyx).
 """
 
 from libc.math cimport NAN, ceil, sqrt

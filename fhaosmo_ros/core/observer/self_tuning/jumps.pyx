@@ -11,13 +11,13 @@ mean (Willsky and Jones 1976).
 from libc.math cimport INFINITY, fabs, fmax, fmin, log, pow, sqrt
 from libc.string cimport memcpy, memset
 
-from fhaosmo_ros.core.observer.self_tuning.filters cimport HUBER
 from fhaosmo_ros.core.observer.self_tuning.members cimport (
-    COUNT, GRID, HALF, Line, MOST_STATES, Members, ORDERS, Sample, Shared, WINDOW,
-    by_binomials, factorial, power, put, state
+    COUNT, GRID, HALF, HUBER, INEXACT, MOST_STATES, ORDERS, WINDOW, Line, Members, Sample,
+    Shared, Work, by_binomials, entry, factorial, fill, power, put, state
 )
 from fhaosmo_ros.core.observer.self_tuning.noise cimport FADED, ROUGH
 from fhaosmo_ros.core.observer.structure cimport GATE, LOST_SAMPLES
+from fhaosmo_ros.core.vectors cimport VECTORISED
 
 # Where unlikely samples are farther off than the first one, d may have jumped (D 33). Farther
 # means: so many times as far at least, and 3 sigma more; and so many times the highest differences
@@ -27,6 +27,8 @@ cdef double FARTHER = 1.3, SMOOTH = 5.0, SMOOTHEST = 30.0
 # From one usual value to the opposite one d jumps by so many times its usual size.
 cdef double USUAL_JUMP = 2.0
 
+
+# Of d
 
 cdef void begin_growth(Members* m) noexcept nogil:
     """Take the first of the unlikely samples in a row."""
@@ -84,6 +86,50 @@ cdef bint has_jumped(Members* m, double beyond) noexcept nogil:
     jump = log(jump / (USUAL_JUMP * sqrt(shared.size_of_d)))
     return (shared.growing - 1.0) * log(off / uneven) > 2.0 * jump
 
+
+cdef VECTORISED allow_jump(Members* m, double y, double tau) noexcept nogil:
+    """
+    Let the members believe that d has jumped: raise P as far as the sample asks for it (D 33).
+
+    It was `tau` ago; 0 for the samples that follow, for which P knows what is uncertain. What the
+    noise was before does not count, so that coloured noise begins afresh. Innovations, their
+    variances, and the predicted P and P C' are replaced.
+    """
+    cdef Work* w = &m.work
+    cdef int n = m.n, i, j
+    cdef Py_ssize_t g, active = m.shared.active
+    cdef double part, variance, square
+    cdef double* row
+    cdef double* one
+    fill(w.one, m.used_noise)
+    for g in range(active):
+        w.b[g] = y - w.x.z[0][g]
+        square = w.b[g] * w.b[g]
+        variance = w.p.zz[0][g] + w.one[g] / (1.0 - m.correlation[g] * m.correlation[g])
+        w.two[g] = square - variance if square > HUBER * HUBER * variance else 0.0
+        w.s[g] = INEXACT * (variance + w.two[g]) / w.one[g]
+        if tau == 0.0:
+            w.two[g] = 1.0 + (w.two[g] / w.p.zz[0][g] if w.p.zz[0][g] > 0.0 else 0.0)
+    for i in range(n + ORDERS):
+        for j in range(i, n + ORDERS):
+            row = entry(&w.p, n, i, j)
+            if tau == 0.0:
+                part = INEXACT if i == j else 1.0
+                for g in range(active):
+                    row[g] *= part * w.two[g]
+            elif j <= n:  # at its begin, or at any time of it
+                part = factorial(n) / factorial(n - i) * factorial(n) / factorial(n - j)
+                part *= 0.5 + 0.5 * (2.0 * n + 1.0) / (2.0 * n + 1.0 - i - j)
+                part /= power(tau, i + j)
+                for g in range(active):
+                    row[g] += part * w.two[g]
+    for i in range(n + ORDERS):
+        row, one = state(&w.pc, n, i), entry(&w.p, n, 0, i)
+        for g in range(active):
+            row[g] = one[g]
+
+
+# Of y
 
 cdef void watch(Members* m, int member) noexcept nogil:
     """Begin to follow the innovations of a member."""

@@ -157,7 +157,8 @@ cdef struct Members:
 
 
 cdef Grid GRID
-cdef double DECAY  # kappa / omega
+cdef double BAND_STEP, DECAY  # omega of a band over that of the one before; kappa / omega
+cdef double EXACT, HUBER, INEXACT
 
 cdef inline int pair(int i, int j) noexcept nogil:
     """Return the place of the covariance of z_i and z_j."""
@@ -185,4 +186,9 @@ cdef double factorial(int i) noexcept nogil
 cdef double power(double x, int count) noexcept nogil
 cdef void by_binomials(double* chain, int count, double more) noexcept nogil
 cdef void put(Members* m, int g, const double* estimate) noexcept nogil
-cdef void find_tuning(Members* m, double* found) noexcept nogil
+cdef VECTORISED predict_states(
+    Members* m, double h, const double* mean, const double* predicted
+) noexcept nogil
+cdef VECTORISED expect(Members* m, double h, double y) noexcept nogil
+cdef VECTORISED correct(Members* m, bint by_interval) noexcept nogil
+cdef VECTORISED correct_states(Members* m, double y) noexcept nogil

@@ -6,21 +6,16 @@ from fhaosmo_ros.core.vectors cimport VECTORISED
 
 cdef double APART, FADED, LATTICE_SHARE, ROUGH, ROUNDED, STEADY
 
-cdef bint is_multiple(double step, double quantum, double y) noexcept nogil
-cdef double divided(double quantum, double step, double y) noexcept nogil
 cdef void follow_quantum(Members* m) noexcept nogil
 cdef double rounding(Members* m) noexcept nogil
-cdef void differences(
-    const double* y, const double* ages, double unit, int order, double* found
-) noexcept nogil
-cdef double usual_speed(Members* m) noexcept nogil
-cdef double share_of_stamps(Members* m, double share, double most) noexcept nogil
 cdef double bound_of_noise(Members* m, int colour, int order) noexcept nogil
+cdef bint is_even(Members* m) noexcept nogil
+cdef double usual_speed(Members* m) noexcept nogil
 cdef void follow_differences(Members* m, double y, double h) noexcept nogil
 cdef double periods(Members* m, double interval) noexcept nogil
 cdef void follow_stamps(Members* m, double interval, double change) noexcept nogil
 cdef VECTORISED fill_noise(Members* m) noexcept nogil
 cdef VECTORISED find_knowing(Members* m, bint unlikely_before) noexcept nogil
-cdef bint is_even(Members* m) noexcept nogil
 cdef bint is_likely(Members* m, double gate, double late) noexcept nogil
 cdef VECTORISED follow_noise(Members* m) noexcept nogil
+cdef double find_noise(Members* m) noexcept nogil

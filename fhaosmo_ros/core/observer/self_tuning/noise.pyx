@@ -3,9 +3,9 @@
 
 from libc.math cimport INFINITY, M_2_PI, erf, exp, fabs, fmax, fmin, round, sqrt
 
-from fhaosmo_ros.core.observer.self_tuning.filters cimport EXACT, HUBER
 from fhaosmo_ros.core.observer.self_tuning.members cimport (
-    CLOCKS, COLOURS, DIFFERENCES, GRID, HALF, Members, Sample, Shared, Work, fill, largest
+    CLOCKS, COLOURS, DIFFERENCES, EXACT, FIRST_SAMPLES, GRID, HALF, HUBER, Members, Sample,
+    Shared, Work, fill, largest
 )
 from fhaosmo_ros.core.vectors cimport VECTORISED
 from fhaosmo_ros.core.observer.structure cimport LOST_SAMPLES
@@ -41,6 +41,8 @@ cdef double PROMPT = 0.02
 # has far smaller ones.
 cdef double FLAT = 0.5
 cdef double ROUNDED = 1e-12  # what is less than this part of a number may be an error of 64 bits
+cdef double LEAST = 1e-150  # noise: its square is not 0
+cdef double MEDIAN = 0.6745  # of |x| where x is normal with variance 1
 cdef double ROUGH = 2.0  # the variance of the noise is at most so many times what they say
 
 
@@ -319,3 +321,124 @@ cdef VECTORISED follow_noise(Members* m) noexcept nogil:
         if rest > FLAT * bound_of_noise(m, c, m.n):
             m.noise[c] = fmax(m.noise[c], FLAT * FLAT * rest)
     fill_noise(m)
+
+
+# The first samples
+
+cdef double find_quantum(const double* values, double least) noexcept nogil:
+    """
+    Return the smallest step above `least`; INFINITY if none is.
+
+    Where others are no multiples, it may be one itself, of what they leave of it: 2 of 2, 3, 2, ..
+    """
+    cdef double quantum = INFINITY, step
+    cdef int i
+    for i in range(1, FIRST_SAMPLES):
+        step = fabs(values[i] - values[i - 1])
+        if step > least:
+            quantum = fmin(quantum, step)
+    for i in range(1, FIRST_SAMPLES):
+        if share_of_multiples(values, quantum) < LATTICE_SHARE:
+            quantum = divided(quantum, fabs(values[i] - values[i - 1]), values[i])
+    return quantum
+
+
+cdef double share_of_multiples(const double* values, double quantum) noexcept nogil:
+    """Return the share of multiples of `quantum` among the steps; 1 if many samples repeat."""
+    cdef double steps = 0.0, multiples = 0.0, step
+    cdef int i
+    for i in range(1, FIRST_SAMPLES):
+        step = fabs(values[i] - values[i - 1])
+        if step >= 0.99 * quantum:
+            steps += 1.0
+            multiples += is_multiple(step, quantum, values[i])
+    return multiples / steps if steps > LATTICE_SHARE * (FIRST_SAMPLES - 1) else 1.0
+
+
+cdef double period_of_bursts(const double* intervals, double mean) noexcept nogil:
+    """Return the period of samples that come in bursts, from the first to the last whole one."""
+    cdef double passed = 0.0, until = 0.0
+    cdef int i, first = 0, last = 0
+    for i in range(1, FIRST_SAMPLES):
+        passed += intervals[i] if first > 0 else 0.0
+        if intervals[i] > mean:
+            first = first if first > 0 else i
+            last, until = i, passed
+    return until / (last - first) if last > first else mean
+
+
+cdef double median(double* values, int count) noexcept nogil:
+    """Return the median of `count` values; sorts these in place."""
+    cdef double value
+    cdef int i, j
+    for i in range(1, count):
+        value, j = values[i], i
+        while j > 0 and values[j - 1] > value:
+            values[j] = values[j - 1]
+            j -= 1
+        values[j] = value
+    return values[count // 2]
+
+
+cdef double find_noise(Members* m) noexcept nogil:
+    """
+    Return the standard deviation of the noise on the first samples.
+
+    Also write the quantum, how exact the stamps are, the mean interval, and what differences of y
+    say that the noise is at most.
+    """
+    cdef Shared* shared = &m.shared
+    cdef double found[DIFFERENCES]
+    cdef double values[DIFFERENCES][FIRST_SAMPLES]
+    cdef double rough[CLOCKS][DIFFERENCES]
+    cdef double ages[CLOCKS][FIRST_SAMPLES]
+    cdef double quantum, noise = INFINITY, by_stamps = INFINITY, size = 0.0, period = 0.0, least
+    cdef int order, most, i, c, clock
+    for i in range(FIRST_SAMPLES):
+        size = fmax(size, fabs(m.first_y[i]))
+    least, quantum = fmax(1e-9 * size, LEAST), find_quantum(m.first_y, ROUNDED * size)
+    for i in range(1, FIRST_SAMPLES):
+        period += m.first_h[i] / (FIRST_SAMPLES - 1)
+        values[0][i - 1] = fabs(m.first_h[i] - m.first_h[i - 1])
+    size = median(values[0] + 1, FIRST_SAMPLES - 2) / MEDIAN
+    for i in range(1, FIRST_SAMPLES):
+        values[1][i - 1] = m.first_h[i]
+    shared.steady_period = period
+    shared.usual_interval = median(values[1], FIRST_SAMPLES - 1)
+    if values[1][FIRST_SAMPLES // 4] < 0.5 * period:
+        shared.usual_interval = period_of_bursts(m.first_h, period)
+    shared.jitter = fmax(size * size / 6.0, (EXACT * period) * (EXACT * period))
+    ages[0][0] = ages[1][0] = 0.0
+    for i in range(1, FIRST_SAMPLES):
+        ages[0][i] = ages[0][i - 1] - period
+        ages[1][i] = ages[1][i - 1] - fmax(m.first_h[i], EXACT * period)
+    for clock in range(CLOCKS):
+        for i in range(FIRST_SAMPLES - 1):
+            most = min(m.n + 1, FIRST_SAMPLES - 1 - i)
+            differences(m.first_y + i, ages[clock] + i, period, most, found)
+            for order in range(1, most + 1):
+                values[order][i] = fabs(found[order])
+        for order in range(1, m.n + 2):
+            size = median(values[order], FIRST_SAMPLES - order) / MEDIAN
+            rough[clock][order] = size * size
+            if size > 0.0:
+                noise = fmin(noise, size)
+                if clock:
+                    by_stamps = fmin(by_stamps, size)
+    if quantum < INFINITY:
+        shared.quantum = quantum
+        shared.lattice = share_of_multiples(m.first_y, quantum)
+        if shared.lattice > LATTICE_SHARE:
+            noise = fmax(quantum / sqrt(12.0), noise if noise < INFINITY else 0.0)
+    if noise == INFINITY:
+        noise = quantum if quantum < INFINITY else least
+    noise = fmax(noise, least)
+    for clock in range(CLOCKS):
+        rough[clock][0] = 0.0
+        for order in range(m.n + 2):
+            for c in range(COLOURS):
+                m.rough[clock][c][order] = fmax(rough[clock][order], noise * noise)
+    for c in range(COLOURS):
+        m.noise[c] = noise * noise
+        m.late[c] = share_of_stamps(m, 1.0, by_stamps * by_stamps)
+    return sqrt(noise * noise + m.late[0] * shared.jitter * usual_speed(m))

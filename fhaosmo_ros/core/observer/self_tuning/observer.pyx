@@ -6,26 +6,23 @@ from libc.stdlib cimport calloc, free
 from libc.string cimport memcpy, memset
 
 from fhaosmo_ros.core.model.prediction cimport MOST_LEVELS
-from fhaosmo_ros.core.observer.self_tuning.filters cimport (
-    EXACT, HUBER, allow_jump, correct, correct_states, expect, predict_states
-)
 from fhaosmo_ros.core.observer.self_tuning.intervals cimport choose_members, take_interval
 from fhaosmo_ros.core.observer.self_tuning.jumps cimport (
-    SMOOTHEST, begin_growth, follow_innovations, follow_jump, has_jumped, samples_since_jump,
-    shift, watch
+    SMOOTHEST, allow_jump, begin_growth, follow_innovations, follow_jump, has_jumped,
+    samples_since_jump, shift, watch
 )
 from fhaosmo_ros.core.observer.self_tuning.members cimport (
-    BANDS, CLOCKS, COLOURS, COUNT, DECAY, DIFFERENCES, FIRST_SAMPLES, GRID, HALF, IN_BAND, Line,
-    MOST_ORDER, MOST_STATES, Members, ORDERS, Sample, Shared, WINDOW, Work, entry, find_tuning, put
+    BANDS, CLOCKS, COLOURS, COUNT, DECAY, DIFFERENCES, EXACT, FIRST_SAMPLES, GRID, HALF, HUBER,
+    IN_BAND, MOST_ORDER, MOST_STATES, ORDERS, WINDOW, Line, Members, Sample, Shared, Work,
+    correct, correct_states, entry, expect, predict_states, put
 )
 from fhaosmo_ros.core.observer.self_tuning.noise cimport (
     APART, FADED, LATTICE_SHARE, ROUNDED, STEADY, bound_of_noise, fill_noise, find_knowing,
-    follow_differences, follow_noise, follow_quantum, follow_stamps, is_even, is_likely, periods,
-    rounding, usual_speed
+    follow_differences, follow_noise, follow_quantum, follow_stamps, is_even, is_likely,
+    periods, rounding, usual_speed
 )
-from fhaosmo_ros.core.observer.self_tuning.start cimport gather
 from fhaosmo_ros.core.observer.self_tuning.weights cimport (
-    Model, judge, mix, tell_model, weigh
+    Model, find_tuning, gather, judge, mix, tell_model, weigh
 )
 from fhaosmo_ros.core.observer.status cimport JUMPED
 from fhaosmo_ros.core.observer.structure cimport (

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How likely each member is, and the mean of all (D 28)."""
+"""The members begin; how likely each of them is, and the mean of all (D 28, D 34)."""
 
 from fhaosmo_ros.core.observer.self_tuning.members cimport Members
 from fhaosmo_ros.core.vectors cimport VECTORISED
@@ -15,7 +15,9 @@ cdef struct Model:
 
 cdef double FLOOR
 
+cdef void gather(Members* m) noexcept nogil
 cdef VECTORISED judge(Members* m, double grown, double kept) noexcept nogil
 cdef VECTORISED weigh(Members* m) noexcept nogil
 cdef VECTORISED mix(Members* m, double* mean, double* variances) noexcept nogil
 cdef void tell_model(Members* m, bint jumped, Model* model) noexcept nogil
+cdef void find_tuning(Members* m, double* found) noexcept nogil

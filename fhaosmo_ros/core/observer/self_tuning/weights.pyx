@@ -1,21 +1,127 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How likely each member is, and the mean of all (D 28)."""
+"""The members begin; how likely each of them is, and the mean of all (D 28, D 34)."""
 
-from libc.math cimport M_PI, NAN, cos, exp, fmin, isfinite, log, pow, sqrt
+from libc.math cimport INFINITY, M_PI, NAN, cos, exp, fabs, fmin, isfinite, log, pow, sqrt
+from libc.string cimport memset
 
-from fhaosmo_ros.core.observer.self_tuning.filters cimport HUBER
+from fhaosmo_ros.core.observer.self_tuning.jumps cimport watch
 from fhaosmo_ros.core.observer.self_tuning.members cimport (
-    COLOURS, FIRST_SAMPLES, GRID, Members, ORDERS, Shared, Work, entry, fill, largest, power
+    BAND_STEP, COLOURS, COUNT, DECAY, FIRST_SAMPLES, GRID, HALF, HUBER, ORDERS, Estimates,
+    Line, Members, Shared, Work, entry, factorial, fill, largest, pair, power
 )
-from fhaosmo_ros.core.observer.self_tuning.noise cimport FADED
-from fhaosmo_ros.core.vectors cimport VECTORISED
+from fhaosmo_ros.core.observer.self_tuning.noise cimport (
+    FADED, ROUNDED, find_noise, follow_differences
+)
 from fhaosmo_ros.core.observer.structure cimport GATE
+from fhaosmo_ros.core.vectors cimport VECTORISED
 
 # No log-likelihood falls further below the best one (D 28, D 31), but by what the member's prior
 # is below that of the likeliest: a larger d needs more reason to be believed.
 # One that is FLOOR below has no weight.
 cdef double FLOOR = 30.0
+# States may be so many times as large: a start that is too sure of them costs more than one that
+# is not sure enough.
+cdef double DOUBT = 10.0
 
+
+# The first samples
+
+cdef void gather(Members* m) noexcept nogil:
+    """
+    Collect the first samples; once there are enough, let the members begin (D 28).
+
+    y may be constant until its sensor is ready: then the last constant one is the first of them.
+    """
+    cdef Shared* shared = &m.shared
+    cdef double y = m.work.sample.y
+    cdef int count = min(max(shared.samples, 1), FIRST_SAMPLES - 1)
+    if count == 1:
+        m.first_y[0], m.first_h[0] = m.work.sample.before, 0.0
+    if count > 1 or fabs(y - m.first_y[0]) > ROUNDED * fabs(y):
+        m.first_y[count], m.first_h[count] = y, m.work.sample.h
+        count += 1
+    shared.samples = count
+    if count == FIRST_SAMPLES:
+        begin(m, find_noise(m))
+        shared.samples = FIRST_SAMPLES + 1
+
+
+cdef void find_sizes(Members* m) noexcept nogil:
+    """Find mean squares of z, with doubt, by differences of the first samples."""
+    cdef double first[FIRST_SAMPLES]
+    cdef double total
+    cdef int stride = (FIRST_SAMPLES - 1) // m.n, length, i, j
+    m.sizes[0] = 0.0
+    for j in range(FIRST_SAMPLES):
+        first[j] = m.first_y[j]
+    for i in range(1, m.n):
+        length, total = FIRST_SAMPLES - i * stride, 0.0
+        for j in range(length):
+            first[j] = (first[j + stride] - first[j]) / (stride * m.shared.steady_period)
+            total += first[j] * first[j]
+        m.sizes[i] = DOUBT * DOUBT * total / length
+
+
+cdef void begin(Members* m, double noise) noexcept nogil:
+    """Let the members begin at the last sample (D 28)."""
+    cdef Shared* shared = &m.shared
+    cdef double y = m.first_y[FIRST_SAMPLES - 1], period = shared.steady_period
+    cdef double omega, kappa, intensity, size, least = INFINITY, sizes = 0.0
+    cdef int n = m.n, g, i, j, k, below, c
+    find_sizes(m)
+    shared.moving, shared.active = HALF, COUNT
+    shared.unsettled = shared.flow_period = 0.0
+    shared.first_noise = noise * noise
+    for c in range(COLOURS):
+        m.used_noise[c] = noise * noise
+    for g in range(COUNT):
+        c, omega = GRID.colour[g], GRID.bandwidth[g] / period
+        m.kappa[g], m.correlation[g] = DECAY * omega, GRID.correlation[c]
+        m.tau[g] = -period / log(GRID.correlation[c]) if c > 0 else 0.0
+    memset(m.difference, 0, sizeof(m.difference))
+    for j in range(n + 2):
+        m.latest_y[j], m.ages[j] = m.first_y[0], j * period
+    shared.roughness = 1.0
+    for j in range(1, FIRST_SAMPLES):
+        follow_differences(m, m.first_y[j], m.first_h[j])
+    memset(m.flow, 0, sizeof(m.flow))  # of members that were lost it may be anything
+    memset(m.decayed, 0, sizeof(Line))
+    memset(&m.gain, 0, sizeof(Estimates))
+    memset(&m.x, 0, sizeof(Estimates))
+    memset(m.p.zz, 0, n * (n + 1) // 2 * sizeof(Line))
+    memset(m.p.zd, 0, n * ORDERS * sizeof(Line))
+    memset(m.p.dd, 0, sizeof(m.p.dd))
+    memset(m.drive, 0, sizeof(m.drive))
+    for g in range(COUNT):
+        omega, kappa, k = GRID.bandwidth[g] / period, m.kappa[g], GRID.order[g]
+        intensity = noise * noise * period * power(omega, 2 * (n + 1 + k))
+        m.drive[k][g] = intensity
+        m.x.z[0][g], m.p.zz[0][g] = y, noise * noise
+        for i in range(1, n):
+            m.p.zz[pair(i, i)][g] = m.sizes[i]
+        for i in range(k + 1):
+            for j in range(i, k + 1):
+                below = 2 * k - i - j
+                m.p.dd[i][j][g] = intensity * factorial(below) / (
+                    factorial(k - i) * factorial(k - j) * power(2.0 * kappa, below + 1)
+                )
+        size = log(m.p.dd[0][0][g] / m.p.dd[0][0][0])
+        m.prior[g] = -0.5 * size
+        least = fmin(least, size)
+        sizes += size
+    # Before samples have told: the geometric mean of what the members expect.
+    shared.size_of_d = m.p.dd[0][0][0] * exp(sizes / COUNT)
+    for g in range(COUNT):
+        m.prior[g] += 0.5 * least
+        m.score[g] = m.prior[g]
+        m.variance[g] = m.short_mean[g] = 1.0
+        m.log_variance[g] = m.residual[g] = m.far[g] = 0.0
+    weigh(m)
+    shared.told = shared.likeliest
+    watch(m, shared.told)
+
+
+# A sample
 
 cdef VECTORISED judge(Members* m, double grown, double kept) noexcept nogil:
     """
@@ -139,3 +245,19 @@ cdef VECTORISED mix(Members* m, double* mean, double* variances) noexcept nogil:
         mean[n] = total
     if not isfinite(lost):
         mean[0] = NAN
+
+
+cdef void find_tuning(Members* m, double* found) noexcept nogil:
+    """Write noise, correlation, bandwidth and shares of models: the fields of `Tuning`."""
+    cdef double variance = 0.0, correlation = 0.0, bands = 0.0, w, a
+    cdef int g, c
+    for g in range(ORDERS):
+        found[3 + g] = 0.0
+    for g in range(COUNT):
+        w, a, c = m.weight[g], m.correlation[g], GRID.colour[g]
+        variance += w * (m.noise[c] + m.late[c] * m.shared.of_stamps) / (1.0 - a * a)
+        correlation += w * a
+        bands += w * GRID.band[g]
+        found[3 + GRID.order[g]] += w
+    found[0], found[1] = sqrt(variance), correlation
+    found[2] = m.kappa[HALF] / DECAY * exp(bands * log(BAND_STEP))
