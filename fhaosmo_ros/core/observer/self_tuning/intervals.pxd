@@ -4,5 +4,5 @@
 from fhaosmo_ros.core.observer.self_tuning.members cimport Members
 from fhaosmo_ros.core.vectors cimport VECTORISED
 
-cdef VECTORISED take_interval(Members* m, double kept) noexcept nogil
-cdef bint choose_members(Members* m, double quanta) noexcept nogil
+cdef VECTORISED take_interval(Members* m) noexcept nogil
+cdef bint choose_members(Members* m) noexcept nogil

@@ -13,7 +13,7 @@ from libc.stdlib cimport calloc, free
 from fhaosmo_ros.core.observer.self_tuning.members cimport (
     COLOURS, COUNT, GRID, HALF, HUBER, INEXACT, ORDERS, Members, Work, entry, state
 )
-from fhaosmo_ros.core.observer.self_tuning.weights cimport FLOOR
+from fhaosmo_ros.core.observer.self_tuning.weights cimport FLOOR, KEPT
 from fhaosmo_ros.core.vectors cimport VECTORISED
 from fhaosmo_ros.core.observer.structure cimport GATE
 
@@ -190,17 +190,16 @@ cdef VECTORISED go_on(
         w.chance[g] = w.chance[g] if w.chance[g] < passed else passed
 
 
-cdef VECTORISED take_interval(Members* m, double kept) noexcept nogil:
+cdef VECTORISED take_interval(Members* m) noexcept nogil:
     """
     Take a quantised sample into the log-likelihoods, and find how it corrects members (D 31).
 
-    For `correct` and `correct_states`. Members with coloured noise do not take part. `kept` is as
-    `judge` has it.
+    For `correct` and `correct_states`. Members with coloured noise do not take part.
     """
     cdef Work* w = &m.work
     cdef Py_ssize_t g, active = m.shared.active
     cdef double y = w.sample.y, before = w.sample.before, half = sqrt(3.0 * w.sample.quanta)
-    cdef double vague = 2.0 * VAGUE * half
+    cdef double vague = 2.0 * VAGUE * half, kept = KEPT
     # Noise that is not of rounding, and what no P knows.
     cdef double least = fmax(w.now[0] - w.sample.quanta, 0.0) + vague * vague
     cdef double carried = 2.0 * fmin(OF_BACK * m.shared.goes_back, 1.0) * least
@@ -210,8 +209,6 @@ cdef VECTORISED take_interval(Members* m, double kept) noexcept nogil:
             m.far[g] + 1.0 if w.b[g] * w.b[g] > GATE * GATE * w.s[g] * w.now[0] else 0.0
         )
     truncate(m, half, least, y == before)
-    if kept < 0.0:
-        return
     if y == before:
         stay(m, speed, half, least, carried)
     elif fabs(y - before) < 3.0 * half:
@@ -222,7 +219,7 @@ cdef VECTORISED take_interval(Members* m, double kept) noexcept nogil:
         )
 
 
-cdef bint choose_members(Members* m, double quanta) noexcept nogil:
+cdef bint choose_members(Members* m) noexcept nogil:
     """
     Choose who takes part: where y is quantised, those with white noise (D 31).
 
@@ -230,7 +227,7 @@ cdef bint choose_members(Members* m, double quanta) noexcept nogil:
     noise go on from those with white noise. Return True if it is others than before.
     """
     cdef int before = m.shared.active, i, j, g, white
-    m.shared.active = HALF if quanta > 0.0 else COUNT
+    m.shared.active = HALF if m.work.sample.quanta > 0.0 else COUNT
     if m.shared.active < before:
         for g in range(HALF, COUNT):
             m.weight[g], m.score[g] = 0.0, -FLOOR

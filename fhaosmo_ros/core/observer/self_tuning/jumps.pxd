@@ -8,7 +8,7 @@ cdef double SMOOTHEST
 
 cdef void begin_growth(Members* m) noexcept nogil
 cdef bint has_jumped(Members* m, double beyond) noexcept nogil
-cdef VECTORISED allow_jump(Members* m, double y, double tau) noexcept nogil
+cdef VECTORISED allow_jump(Members* m, double tau) noexcept nogil
 cdef void watch(Members* m, int member) noexcept nogil
 cdef void follow_innovations(Members* m) noexcept nogil
 cdef int samples_since_jump(Members* m) noexcept nogil

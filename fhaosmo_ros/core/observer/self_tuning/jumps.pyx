@@ -87,7 +87,7 @@ cdef bint has_jumped(Members* m, double beyond) noexcept nogil:
     return (shared.growing - 1.0) * log(off / uneven) > 2.0 * jump
 
 
-cdef VECTORISED allow_jump(Members* m, double y, double tau) noexcept nogil:
+cdef VECTORISED allow_jump(Members* m, double tau) noexcept nogil:
     """
     Let the members believe that d has jumped: raise P as far as the sample asks for it (D 33).
 
@@ -98,7 +98,7 @@ cdef VECTORISED allow_jump(Members* m, double y, double tau) noexcept nogil:
     cdef Work* w = &m.work
     cdef int n = m.n, i, j
     cdef Py_ssize_t g, active = m.shared.active
-    cdef double part, variance, square
+    cdef double y = w.sample.y, part, variance, square
     cdef double* row
     cdef double* one
     fill(w.one, m.used_noise)
@@ -179,9 +179,8 @@ cdef int samples_since_jump(Members* m) noexcept nogil:
     g = shared.followed
     if best <= GATE * GATE or first < WINDOW // 2 or GRID.bandwidth[g] * WINDOW > 1.0:
         return 0
-    if shared.since_mark < WINDOW:  # too soon after a jump: rather d explains both
-        return 0
-    if best <= otherwise(m.window, m.n) + FADED:
+    # Too soon after a jump rather d explains both.
+    if shared.since_mark < WINDOW or best <= otherwise(m.window, m.n) + FADED:
         return 0
     before = &m.score_before[0 if shared.since_mark % WINDOW >= count else 1][0]
     gained = m.score[g] - before[g]

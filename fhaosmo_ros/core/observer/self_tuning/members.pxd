@@ -91,7 +91,6 @@ cdef struct Shared:
     # What all members share.
     int samples  # gathered; more than FIRST_SAMPLES once the members run
     int active  # members that take part: all, or HALF where y is quantised; 0 before they begin
-    int moving  # members of each half whose covariances move
     int likeliest  # the likeliest member
     int told  # the member whose model a smoother goes by (D 34)
     int followed  # the member whose innovations are looked at for a jump of y (D 35)
@@ -108,7 +107,6 @@ cdef struct Shared:
     double quantum  # step of y of which the others may be multiples (unit of y)
     double lattice  # of late, the share of the steps of y that are
     double goes_back  # of late, the share of the steps of y that go back at once
-    double far_sign  # sign of the last innovation that was too far off for every member
     double growing  # unlikely samples in a row that are farther and farther off (D 33)
     double size_of_d  # mean square of d of late, by its estimates and their variances
     double first_off  # how far off the first of the unlikely samples in a row was
@@ -187,8 +185,8 @@ cdef double power(double x, int count) noexcept nogil
 cdef void by_binomials(double* chain, int count, double more) noexcept nogil
 cdef void put(Members* m, int g, const double* estimate) noexcept nogil
 cdef VECTORISED predict_states(
-    Members* m, double h, const double* mean, const double* predicted
+    Members* m, const double* mean, const double* predicted
 ) noexcept nogil
-cdef VECTORISED expect(Members* m, double h, double y) noexcept nogil
+cdef VECTORISED expect(Members* m) noexcept nogil
 cdef VECTORISED correct(Members* m, bint by_interval) noexcept nogil
-cdef VECTORISED correct_states(Members* m, double y) noexcept nogil
+cdef VECTORISED correct_states(Members* m) noexcept nogil

@@ -125,13 +125,13 @@ cdef void put(Members* m, int g, const double* estimate) noexcept nogil:
 # Prediction
 
 cdef VECTORISED predict_states(
-    Members* m, double h, const double* mean, const double* predicted
+    Members* m, const double* mean, const double* predicted
 ) noexcept nogil:
     """Predict the members' estimates: the mean's path, plus the flow of their deviations."""
     cdef Work* w = &m.work
     cdef int n = m.n, i, j
     cdef Py_ssize_t g, active = m.shared.active
-    cdef double a = h, b = h * h / 2.0, c = h * h * h / 6.0, base, f, f1, f2, f3, kappa
+    cdef double h = w.sample.h, b = h * h / 2.0, c = h * h * h / 6.0, base, f, f1, f2, f3, kappa
     for i in range(n):
         base = predicted[i]
         for j in range(n + ORDERS):
@@ -154,10 +154,10 @@ cdef VECTORISED predict_states(
                     w.x.z[i][g] += f * m.x.z[j][g]
     for g in range(active):  # exp of D 17: e^(-kappa h) times a polynomial
         w.x.d[0][g] = m.decayed[g] * (
-            m.x.d[0][g] + a * m.x.d[1][g] + b * m.x.d[2][g] + c * m.x.d[3][g]
+            m.x.d[0][g] + h * m.x.d[1][g] + b * m.x.d[2][g] + c * m.x.d[3][g]
         )
-        w.x.d[1][g] = m.decayed[g] * (m.x.d[1][g] + a * m.x.d[2][g] + b * m.x.d[3][g])
-        w.x.d[2][g] = m.decayed[g] * (m.x.d[2][g] + a * m.x.d[3][g])
+        w.x.d[1][g] = m.decayed[g] * (m.x.d[1][g] + h * m.x.d[2][g] + b * m.x.d[3][g])
+        w.x.d[2][g] = m.decayed[g] * (m.x.d[2][g] + h * m.x.d[3][g])
         w.x.d[3][g] = m.decayed[g] * m.x.d[3][g]
 
 
@@ -166,14 +166,14 @@ cdef inline double share(const double* powers, double h, int a, int b) noexcept 
     return powers[a] * powers[b] * h / (a + b + 1) if a >= 0 and b >= 0 else 0.0
 
 
-cdef VECTORISED integrate_drive(Members* m, double h) noexcept nogil:
+cdef VECTORISED integrate_drive(Members* m) noexcept nogil:
     """Write Q (D 27), unless it is there already."""
     cdef Work* w = &m.work
     cdef int n = m.n, d = n + ORDERS, i, j, k
     cdef Py_ssize_t g
     cdef double powers[MOST_STATES]
     cdef double* row
-    cdef double q
+    cdef double h = w.sample.h, q
     # All other intensities follow from these two (D 26).
     if (w.q_interval == h and w.q_white == m.drive[0][0] and w.q_jerk == m.drive[3][COUNT - 1]
             and w.q_first <= w.first and w.last <= w.q_last):
@@ -193,11 +193,11 @@ cdef VECTORISED integrate_drive(Members* m, double h) noexcept nogil:
                     row[g] += q * m.drive[k][g]
 
 
-cdef VECTORISED predict_drive(Members* m, double h) noexcept nogil:
+cdef VECTORISED predict_drive(Members* m) noexcept nogil:
     """Predict the covariances of d and its derivatives; written out, for speed (D 17)."""
     cdef Work* w = &m.work
     cdef Py_ssize_t g
-    cdef double a = h, b = h * h / 2.0, c = h * h * h / 6.0
+    cdef double a = w.sample.h, b = a * a / 2.0, c = a * a * a / 6.0
     cdef double p11, p12, p13, p22, p23, p33, none, slope, second, third, one, two, three, twice
     for g in range(w.first, w.last):
         p11, p12, p13 = m.p.dd[1][1][g], m.p.dd[1][2][g], m.p.dd[1][3][g]
@@ -256,14 +256,14 @@ cdef VECTORISED multiply(Members* m, int i) noexcept nogil:
                     w.product_z[i][j][g] += f * m.p.zz[pair(k, j)][g]
 
 
-cdef VECTORISED predict_covariances(Members* m, double h) noexcept nogil:
+cdef VECTORISED predict_covariances(Members* m) noexcept nogil:
     """Write A P A' + Q (D 27)."""
     cdef Work* w = &m.work
     cdef int n = m.n, i, j, k
     cdef Py_ssize_t g, first = w.first, last = w.last
-    cdef double a = h, b = h * h / 2.0, c = h * h * h / 6.0, slope, second, third, f
-    integrate_drive(m, h)
-    predict_drive(m, h)
+    cdef double a = w.sample.h, b = a * a / 2.0, c = a * a * a / 6.0, slope, second, third, f
+    integrate_drive(m)
+    predict_drive(m)
     for i in range(n):
         multiply(m, i)
         for g in range(first, last):
@@ -292,12 +292,12 @@ cdef VECTORISED predict_covariances(Members* m, double h) noexcept nogil:
                         w.p.zz[pair(i, j)][g] += f * w.product_z[i][k][g]
 
 
-cdef VECTORISED expect(Members* m, double h, double y) noexcept nogil:
+cdef VECTORISED expect(Members* m) noexcept nogil:
     """Write what the members expect of a sample, P C' and S, and by what it is off (D 27)."""
     cdef Work* w = &m.work
     cdef int n = m.n, i
     cdef Py_ssize_t g
-    cdef double half = 0.5 * h * h, more
+    cdef double y = w.sample.y, h = w.sample.h, half = 0.5 * h * h, more
     cdef double* row
     cdef double* one
     cdef double* two
@@ -307,7 +307,7 @@ cdef VECTORISED expect(Members* m, double h, double y) noexcept nogil:
         w.s[g] = m.variance[g]
     if w.first == w.last:
         return
-    predict_covariances(m, h)
+    predict_covariances(m)
     for i in range(n + ORDERS):  # z_1 of the sample before is the state of now, h back
         row, one, two = state(&w.pc, n, i), entry(&w.p, n, 0, i), entry(&w.p, n, 1, i)
         three = entry(&w.p, n, 2, i)
@@ -354,16 +354,16 @@ cdef VECTORISED correct(Members* m, bint by_interval) noexcept nogil:
                 after[g] = before[g] - w.taken[g] * one[g] * two[g]
 
 
-cdef VECTORISED correct_states(Members* m, double y) noexcept nogil:
+cdef VECTORISED correct_states(Members* m) noexcept nogil:
     """Correct the members' predictions by their innovations, of bounded influence."""
     cdef Work* w = &m.work
     cdef int i
     cdef Py_ssize_t g, active = m.shared.active
     cdef double limits[COLOURS]
-    cdef double a, residual
+    cdef double y = w.sample.y, a, residual
     for i in range(COLOURS):
         a = m.correlation[GRID.first[i]]
-        limits[i] = HUBER * sqrt(m.work.now[i] / (1.0 - a * a))
+        limits[i] = HUBER * sqrt(w.now[i] / (1.0 - a * a))
     fill(w.one, limits)
     for i in range(m.n):
         for g in range(active):

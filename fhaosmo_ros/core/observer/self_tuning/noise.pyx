@@ -147,7 +147,7 @@ cdef double share_of_stamps(Members* m, double share, double most) noexcept nogi
     Differences at the stamps have that in them.
     """
     cdef double prompt = PROMPT * m.shared.steady_period
-    cdef double usual = fmax(m.shared.jitter * usual_speed(m), 1e-300)
+    cdef double usual = fmax(m.shared.jitter * usual_speed(m), LEAST * LEAST)
     share = fmin(share, ROUGH * fmin(most / usual, 1.0))
     return fmax(share, fmin(prompt * prompt / m.shared.jitter, 1.0))
 
@@ -278,10 +278,8 @@ cdef VECTORISED follow_noise(Members* m) noexcept nogil:
     cdef double best[COLOURS]
     cdef double weights[COLOURS]
     cdef double squares[COLOURS]
-    cdef double variance, ratio, off, weight, least, most, more, share, rest
-    cdef double by_stamps
-    cdef double average = sample.average
-    cdef double widest = sample.largest
+    cdef double variance, ratio, off, weight, most, more, share, rest, by_stamps
+    cdef double average = sample.average, widest = sample.largest
     cdef int c
     cdef Py_ssize_t g, active = m.shared.active
     for g in range(active):
@@ -291,8 +289,7 @@ cdef VECTORISED follow_noise(Members* m) noexcept nogil:
         m.short_mean[g] += SHORT_SHARE * (ratio - m.short_mean[g])
         w.ratio[g] = ratio
         w.one[g] = -m.short_mean[g] if variance <= widest else -INFINITY
-    least = fmin(m.shared.roughness, -largest(w.one, active))
-    m.shared.grown = fmax(least, 1.0)
+    m.shared.grown = fmax(fmin(m.shared.roughness, -largest(w.one, active)), 1.0)
     for c in range(COLOURS):
         best[c], weights[c], squares[c] = -INFINITY, 0.0, 0.0
     best[0] = largest(m.score, HALF)
@@ -306,7 +303,7 @@ cdef VECTORISED follow_noise(Members* m) noexcept nogil:
             weight = exp(off) if off < 0.0 else 1.0
             weights[c] += weight
             squares[c] += weight * w.ratio[g]
-    if least > STEADY:  # every member that can judge says so, and the differences do
+    if m.shared.grown > STEADY:
         average = fmin(average, QUICK_SAMPLES)
     for c in range(COLOURS if active > HALF else 1):
         more = (squares[c] / weights[c] / CLIPPED - 1.0) / average

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The self-tuning observer: members side by side, weighted by how well they predict y (D 26)."""
 
-from libc.math cimport INFINITY, NAN, copysign, exp, fabs, fmax, fmin, log, pow, sqrt
+from libc.math cimport INFINITY, NAN, exp, fabs, fmax, fmin, log, pow, sqrt
 from libc.stdlib cimport calloc, free
 from libc.string cimport memcpy, memset
 
@@ -35,7 +35,6 @@ import numpy as np
 
 cdef enum:
     CACHE_LINE = 64  # bytes; a vector of the processor that crosses two takes twice as long
-cdef double MEMORY = 8000.0  # a log-likelihood is remembered for so many samples
 cdef double NOISE_SAMPLES = 1000.0  # the noise is averaged over so many
 # What is beyond 3 sigma in so many samples after a jump of d is due to it, too.
 cdef double JUMP_SAMPLES = 10.0
@@ -49,8 +48,8 @@ cdef double LEAST_NOISE = 1e-3
 cdef double LARGEST = 1e300  # no number of a snapshot is larger, nor is an error of a prediction
 # Ranges of the numbers of a snapshot; others are from 0 to LARGEST.
 RANGES = {'likeliest': (0, COUNT - 1), 'told': (0, COUNT - 1), 'followed': (0, COUNT - 1)}
-RANGES |= {'samples': (0, NOISE_SAMPLES + 1), 'moving': (0, HALF), 'active': (0, COUNT)}
-RANGES |= {'since_mark': (0, 2 * WINDOW - 1), 'far_sign': (-1, 1), 'correlation': (0, 1)}
+RANGES |= {'samples': (0, NOISE_SAMPLES + 1), 'active': (0, COUNT)}
+RANGES |= {'since_mark': (0, 2 * WINDOW - 1), 'correlation': (0, 1)}
 RANGES |= dict.fromkeys((
     'first_y', 'latest_y', 'difference', 'flow', 'window', 'prior', 'score', 'log_variance',
     'residual', 'score_before', 'z', 'd', 'gain_z', 'gain_d', 'p_zz', 'p_zd', 'p_dd',
@@ -102,7 +101,6 @@ cdef class SelfTuning(Structure):
         Structure.reset(self)
         self.begin_afresh()
         memset(&self.model, 0, sizeof(self.model))
-        self.y_jumped = False
         for i in range(self.levels):
             self.variances[i] = INFINITY
 
@@ -133,11 +131,11 @@ cdef class SelfTuning(Structure):
         """See `Structure.advance`."""
         cdef Sample* sample = &self.members.work.sample
         cdef int i, n = self.levels
-        self.trial_model = self.model
+        self.trial_model, self.y_jumped = self.model, False
         sample.y, sample.before, sample.h = y, self.memory.y, h
         if self.has_begun():
             memcpy(self.trial_variances, self.variances, sizeof(self.variances))
-            self.step_members(y, h, u)
+            self.step_members(h, u)
         else:
             for i in range(n):
                 self.level[i].z_hat, self.trial_variances[i] = 0.0, INFINITY
@@ -153,7 +151,7 @@ cdef class SelfTuning(Structure):
             square, size = self.level[i].z_hat * self.level[i].z_hat, self.members.sizes[i]
             self.members.sizes[i] = size + (square - size) / count
         memcpy(self.variances, self.trial_variances, sizeof(self.variances))
-        self.model, self.y_jumped = self.trial_model, False
+        self.model = self.trial_model
         return word
 
     cdef void restart(self, double y) noexcept nogil:
@@ -216,9 +214,9 @@ cdef class SelfTuning(Structure):
 
     # A step of all members
 
-    cdef void step_members(self, double y, double h, const double* u) noexcept nogil:
+    cdef void step_members(self, double h, const double* u) noexcept nogil:
         """
-        Advance the members, and the estimates, to the sample `y`.
+        Advance the members, and the estimates, to a sample.
 
         A sample that is too far off is counted in `Memory.beyond`, and changes no member.
         """
@@ -228,42 +226,43 @@ cdef class SelfTuning(Structure):
         cdef Sample* sample = &w.sample
         cdef Memory* memory = &self.memory
         cdef double mean[MOST_STATES]
-        cdef double expected, since = 0.0, speed, change, late, gate
-        cdef bint goes_on, likely, begins, jumped, rough, smooth, even
-        cdef int i, since_jump = 0
+        cdef double expected, speed, change, late, gate
+        cdef bint goes_on, likely, begins, jumped, rough, even
+        cdef int i, since_jump
         sample.quanta = rounding(m)
-        if choose_members(m, sample.quanta):
+        if choose_members(m):
             weigh(m)
         change = self.follow_interval(h - memory.behind)
-        follow_differences(m, y, memory.interval)
+        follow_differences(m, sample.y, memory.interval)
         follow_stamps(m, memory.interval, change)
         even, rough = is_even(m), sample.roughness > HUBER * HUBER
         sample.average = fmin(shared.samples, NOISE_SAMPLES)
-        speed = self.look(y, h, u)
+        speed = self.look(h, u)
         late = fabs(speed * change) if memory.beyond == 0.0 and not even else 0.0
         sample.uneven += fmax(shared.jitter, sample.irregular) * speed * speed
         sample.floor = fmax(sample.quanta, EXACT * EXACT * m.rough[0][0][1])
         shared.samples = <int>sample.average + 1
         goes_on = (
-            memory.beyond > 0.0 and copysign(1.0, sample.off) == shared.far_sign
+            memory.beyond > 0.0 and (sample.off < 0.0) == (memory.miss < 0.0)
             and not rough and shared.roughness < HUBER
         )
         gate = HUBER if goes_on else GATE
         likely = is_likely(m, gate, late)
         if even and (not likely or self.may_have_waited(change)):
-            likely = self.is_stamped_late(y, h, u, gate) or likely
-        if likely and memory.beyond == 0.0:
-            self.follow_usual_interval()
-        begins = has_jumped(m, memory.beyond)
+            likely = self.is_stamped_late(h, u, gate) or likely
+        # Samples that are used tell the usual interval, but for those of a burst.
+        if likely and memory.beyond == 0.0 and self.passed > 0.5 * shared.usual_interval:
+            shared.usual_interval += (
+                self.passed / periods(m, self.passed) - shared.usual_interval
+            ) / sample.average
+        begins = has_jumped(m, memory.beyond) and not likely
         expected = w.believed[shared.likeliest] * w.noise[shared.likeliest]
         shared.recent = fmax(shared.recent - 1.0, 0.0)
-        begins = begins and not likely
         # After a jump y moves less smoothly than before, but farther than noise would put it off;
         # behind a sample that was passed over it is off for another reason.
-        smooth = fabs(sample.off) > SMOOTHEST * sqrt(sample.uneven)
-        jumped = begins or (
-            shared.recent > 0.0 and memory.beyond == 0.0 and (smooth or not rough)
-        )
+        jumped = begins or (shared.recent > 0.0 and memory.beyond == 0.0 and (
+            not rough or fabs(sample.off) > SMOOTHEST * sqrt(sample.uneven)
+        ))
         if not likely and not jumped:
             self.pass_over()
             self.trial_variances[0] = expected
@@ -276,15 +275,14 @@ cdef class SelfTuning(Structure):
             return
         if jumped:
             if begins:
-                since, shared.recent = sample.since_jump, JUMP_SAMPLES
-            allow_jump(m, y, since)
+                shared.recent = JUMP_SAMPLES
+            allow_jump(m, sample.since_jump if begins else 0.0)
             memset(m.far, 0, sizeof(m.far))
             memcpy(w.believed, w.s, sizeof(Line))
             shared.unsettled = 0.0
         self.take_sample()
         follow_quantum(m)
-        if not jumped:
-            since_jump = samples_since_jump(m)
+        since_jump = 0 if jumped else samples_since_jump(m)
         if since_jump > 2:  # two outliers are no jump
             follow_jump(m, since_jump)
             self.y_jumped = True
@@ -298,7 +296,7 @@ cdef class SelfTuning(Structure):
                 m.far[i] = 0.0
                 put(m, i, mean)
 
-    cdef double look(self, double y, double h, const double* u) noexcept nogil:
+    cdef double look(self, double h, const double* u) noexcept nogil:
         """Predict the members over h, and by what the sample is off; return the speed of y."""
         cdef Members* m = self.members
         cdef Shared* shared = &m.shared
@@ -307,7 +305,7 @@ cdef class SelfTuning(Structure):
         cdef double mean[MOST_STATES]
         cdef double speed
         cdef bint same = fabs(h - shared.flow_period) <= EXACT * shared.flow_period
-        cdef int i
+        cdef int i, moving
         sample.h = h
         self.carry_flow(h, u, same)
         speed = (self.prediction.z[0] - self.level[0].z_hat) / h
@@ -315,18 +313,18 @@ cdef class SelfTuning(Structure):
             speed = sqrt(usual_speed(m))
         shared.of_stamps = shared.jitter * speed * speed
         fill_noise(m)
-        self.follow_period(h, same)
+        moving = self.follow_period(h, same)
         if self.memory.beyond > 0.0 or shared.recent > 0.0 or sample.quanta > 0.0:
-            shared.moving = HALF
+            moving = HALF
         if sample.quanta > 0.0:  # P depends on the samples
             shared.unsettled = 0.0
-        w.first, w.last = HALF - shared.moving, min(HALF + shared.moving, shared.active)
-        sample.off = y - self.prediction.z[0]
+        w.first, w.last = HALF - moving, min(HALF + moving, shared.active)
+        sample.off = sample.y - self.prediction.z[0]
         # A sample that is not likely changes no member: what it makes of them stands apart.
         for i in range(self.levels):
             mean[i] = self.level[i].z_hat
-        predict_states(m, h, mean, self.prediction.z)
-        expect(m, h, y)
+        predict_states(m, mean, self.prediction.z)
+        expect(m)
         find_knowing(m, self.memory.beyond > 0.0)
         return speed
 
@@ -343,17 +341,7 @@ cdef class SelfTuning(Structure):
             off = fmin(off, fabs(change))
         return off > fmax(0.5 * usual, HUBER * sqrt(2.0 * shared.jitter))
 
-    cdef void follow_usual_interval(self) noexcept nogil:
-        """Follow the usual interval by a sample that is used, unless it is one of a burst."""
-        cdef Members* m = self.members
-        if self.passed > 0.5 * m.shared.usual_interval:
-            m.shared.usual_interval += (
-                self.passed / periods(m, self.passed) - m.shared.usual_interval
-            ) / m.work.sample.average
-
-    cdef bint is_stamped_late(
-        self, double y, double h, const double* u, double gate
-    ) noexcept nogil:
+    cdef bint is_stamped_late(self, double h, const double* u, double gate) noexcept nogil:
         """
         Return True if an evenly spaced sample is likelier at another time than its stamp says.
 
@@ -368,11 +356,11 @@ cdef class SelfTuning(Structure):
         if memory.behind == 0.0 or not 0.5 * usual < passed < 2.0 * usual:
             passed = usual + memory.behind / NOISE_SAMPLES
         likelihood = self.likelihood()
-        self.look(y, passed, u)
+        self.look(passed, u)
         if is_likely(self.members, gate, 0.0) and self.likelihood() > likelihood:
             self.passed = passed
             return True
-        self.look(y, h, u)
+        self.look(h, u)
         return False
 
     cdef double likelihood(self) noexcept nogil:
@@ -382,8 +370,8 @@ cdef class SelfTuning(Structure):
         cdef double variance = w.s[g] * w.noise[g]
         return -w.b[g] * w.b[g] / variance - log(variance / self.members.shared.first_noise)
 
-    cdef void follow_period(self, double h, bint same) noexcept nogil:
-        """Decide which covariances move, and what depends on the period (D 27)."""
+    cdef int follow_period(self, double h, bint same) noexcept nogil:
+        """Find what depends on the period, and of how many members of a half P moves (D 27)."""
         cdef Members* m = self.members
         cdef Shared* shared = &m.shared
         cdef double of_colours[COLOURS]
@@ -418,7 +406,7 @@ cdef class SelfTuning(Structure):
             g = HALF + c * IN_BAND
             if m.kappa[g] / DECAY * slowed * shared.unsettled < FADED:
                 moving += IN_BAND
-        shared.moving = min((moving + EVEN - 1) // EVEN * EVEN, HALF)
+        return min((moving + EVEN - 1) // EVEN * EVEN, HALF)
 
     cdef void carry_flow(self, double h, const double* u, bint same) noexcept nogil:
         """Predict the mean, with its derivative by each of its entries (D 27)."""
@@ -440,37 +428,31 @@ cdef class SelfTuning(Structure):
         cdef Shared* shared = &m.shared
         cdef Sample* sample = &m.work.sample
         cdef Memory* memory = &self.memory
-        cdef double sign = copysign(1.0, sample.off)
-        cdef bint other_side = memory.beyond > 0.0 and sign != shared.far_sign
+        cdef bint other_side = memory.beyond > 0.0 and (sample.off < 0.0) != (memory.miss < 0.0)
         if other_side:
             begin_growth(m)
             memory.beyond = 0.0
         memory.beyond += 1.0
-        # Where a prediction has overflowed, two errors are not alike (D 23).
-        memory.miss = sample.off if fabs(sample.off) <= LARGEST else LARGEST
-        if memory.beyond == 1.0:
-            memory.first_miss = sample.off if fabs(sample.off) <= LARGEST else -LARGEST
+        memory.miss = fmax(fmin(sample.off, LARGEST), -LARGEST)
+        if memory.beyond == 1.0:  # two errors are not alike where a prediction has overflowed
+            memory.first_miss = sample.off if sample.off == memory.miss else -memory.miss
         # A y that is off is so on one side, and evenly.
         if other_side or (shared.roughness > HUBER and shared.recent == 0.0):
             follow_noise(m)
-        shared.far_sign = sign
 
     cdef void take_sample(self) noexcept nogil:
         """Correct the members by a sample, and weigh them."""
         cdef Members* m = self.members
         cdef Sample* sample = &m.work.sample
         cdef bint quantised = sample.quanta > 0.0
-        cdef double kept = exp(-1.0 / MEMORY)
         follow_noise(m)
-        if sample.roughness > HUBER * HUBER and not quantised:
-            kept = -1.0  # it does not judge them
         follow_innovations(m)
         if quantised:
-            take_interval(m, kept)
+            take_interval(m)
         correct(m, quantised)
         if not quantised:
-            judge(m, m.shared.grown, kept)
-        correct_states(m, sample.y)
+            judge(m, sample.roughness <= HUBER * HUBER)
+        correct_states(m)
         weigh(m)
 
     # Snapshots and copies
@@ -553,7 +535,6 @@ cdef class SelfTuning(Structure):
             self.begin_afresh()
         self.members.shared, self.members.work.q_interval = shared, 0.0
         self.model = Model(numbers[0], numbers[1], numbers[2], numbers[3])
-        self.y_jumped = False
         for name, number in found.items():
             data = number.tobytes()
             memcpy(<void*><size_t>names[name][0], <char*>data, len(data))

@@ -13,10 +13,10 @@ cdef struct Model:
     double derivatives  # k; k - 4 where d has jumped (D 33)
 
 
-cdef double FLOOR
+cdef double FLOOR, KEPT
 
 cdef void gather(Members* m) noexcept nogil
-cdef VECTORISED judge(Members* m, double grown, double kept) noexcept nogil
+cdef VECTORISED judge(Members* m, bint counts) noexcept nogil
 cdef VECTORISED weigh(Members* m) noexcept nogil
 cdef VECTORISED mix(Members* m, double* mean, double* variances) noexcept nogil
 cdef void tell_model(Members* m, bint jumped, Model* model) noexcept nogil

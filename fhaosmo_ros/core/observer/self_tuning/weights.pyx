@@ -19,6 +19,7 @@ from fhaosmo_ros.core.vectors cimport VECTORISED
 # is below that of the likeliest: a larger d needs more reason to be believed.
 # One that is FLOOR below has no weight.
 cdef double FLOOR = 30.0
+cdef double KEPT = exp(-1.0 / 8000.0)  # part of a log-likelihood that is not forgotten
 # States may be so many times as large: a start that is too sure of them costs more than one that
 # is not sure enough.
 cdef double DOUBT = 10.0
@@ -69,7 +70,7 @@ cdef void begin(Members* m, double noise) noexcept nogil:
     cdef double omega, kappa, intensity, size, least = INFINITY, sizes = 0.0
     cdef int n = m.n, g, i, j, k, below, c
     find_sizes(m)
-    shared.moving, shared.active = HALF, COUNT
+    shared.active = COUNT
     shared.unsettled = shared.flow_period = 0.0
     shared.first_noise = noise * noise
     for c in range(COLOURS):
@@ -88,9 +89,7 @@ cdef void begin(Members* m, double noise) noexcept nogil:
     memset(m.decayed, 0, sizeof(Line))
     memset(&m.gain, 0, sizeof(Estimates))
     memset(&m.x, 0, sizeof(Estimates))
-    memset(m.p.zz, 0, n * (n + 1) // 2 * sizeof(Line))
-    memset(m.p.zd, 0, n * ORDERS * sizeof(Line))
-    memset(m.p.dd, 0, sizeof(m.p.dd))
+    memset(&m.p, 0, sizeof(m.p))
     memset(m.drive, 0, sizeof(m.drive))
     for g in range(COUNT):
         omega, kappa, k = GRID.bandwidth[g] / period, m.kappa[g], GRID.order[g]
@@ -123,21 +122,21 @@ cdef void begin(Members* m, double noise) noexcept nogil:
 
 # A sample
 
-cdef VECTORISED judge(Members* m, double grown, double kept) noexcept nogil:
+cdef VECTORISED judge(Members* m, bint counts) noexcept nogil:
     """
     Take a sample into the log-likelihoods, and bound the innovations (D 27, D 28), in place.
 
-    `kept` is the part of the log-likelihoods that is not forgotten; negative to leave them as they
-    are. Samples in a row that are far off a member are not outliers, but its fault.
+    If it does not count, the log-likelihoods stay. Samples in a row that are far off a member are
+    not outliers, but its fault.
     """
     cdef Work* w = &m.work
     cdef Py_ssize_t g, active = m.shared.active
-    cdef double late, likelihood, most, limit
+    cdef double grown = m.shared.grown, kept = KEPT, late, likelihood, most, limit
     cdef double logs[COLOURS]
     for g in range(active):
         w.ratio[g] = w.b[g] * w.b[g] / (w.s[g] * w.noise[g])
         m.far[g] = m.far[g] + 1.0 if w.ratio[g] > GATE * GATE else 0.0
-    if kept >= 0.0:
+    if counts:
         for g in range(COLOURS):
             logs[g] = log(w.now[g] / m.shared.first_noise)
         fill(w.one, logs)
