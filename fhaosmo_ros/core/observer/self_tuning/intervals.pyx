@@ -11,7 +11,7 @@ from libc.math cimport INFINITY, M_2_PI, M_PI, copysign, erf, exp, fabs, fmax, f
 from libc.stdlib cimport calloc, free
 
 from fhaosmo_ros.core.observer.self_tuning.members cimport (
-    COLOURS, COUNT, GRID, HALF, HUBER, INEXACT, ORDERS, Members, Work, entry, state
+    COLOURS, COUNT, GRID, HALF, HUBER, INEXACT, ORDERS, Members, Work, entry, leeway, state
 )
 from fhaosmo_ros.core.observer.self_tuning.weights cimport FLOOR, KEPT
 from fhaosmo_ros.core.vectors cimport VECTORISED
@@ -124,8 +124,7 @@ cdef VECTORISED truncate(Members* m, double half, double least, bint repeated) n
         share = (log(w.chance[g]) if w.chance[g] != 1.0 else 0.0) - 0.5 * w.one[g]
         w.chance[g] = share if share > LEAST_CHANCE else LEAST_CHANCE
     for g in range(active):
-        off = m.far[g] - 1.0 if m.far[g] > 1.0 else 0.0
-        off = HUBER * (1.0 + off * off)
+        off = HUBER * leeway(m.far[g])
         center = w.mean[g] if w.mean[g] > -off else -off
         center = center if center < off else off
         w.b[g] = center * w.size[g] if w.chance[g] <= known else 0.0

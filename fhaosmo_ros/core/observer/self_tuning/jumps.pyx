@@ -24,8 +24,6 @@ from fhaosmo_ros.core.vectors cimport VECTORISED
 # of y, which noise does not get to. Differences must not have been larger than usual before, but
 # where y is farther off by the last factor.
 cdef double FARTHER = 1.3, SMOOTH = 5.0, SMOOTHEST = 30.0
-# From one usual value to the opposite one d jumps by so many times its usual size.
-cdef double USUAL_JUMP = 2.0
 
 
 # Of d
@@ -83,7 +81,7 @@ cdef bint has_jumped(Members* m, double beyond) noexcept nogil:
     hidden = fmin(GATE * sqrt(m.work.now[0]), shared.first_off) / off
     sample.since_jump = sample.h / (1.0 - pow(hidden, 1.0 / m.n))
     jump = off * factorial(m.n) / power(sample.since_jump, m.n)
-    jump = log(jump / (USUAL_JUMP * sqrt(shared.size_of_d)))
+    jump = log(jump / (2.0 * sqrt(shared.size_of_d)))  # usual: from one value to its opposite
     return (shared.growing - 1.0) * log(off / uneven) > 2.0 * jump
 
 

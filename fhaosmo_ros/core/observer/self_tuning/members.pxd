@@ -178,6 +178,10 @@ cdef inline double* state(Estimates* x, int n, int i) noexcept nogil:
         return x.z[i]
     return x.d[i - n]
 
+cdef inline double leeway(double far) noexcept nogil:
+    """Return how much farther off a sample may be: `far` in a row are no outliers (D 28)."""
+    return 1.0 + (far - 1.0) * (far - 1.0) if far > 1.0 else 1.0
+
 cdef VECTORISED fill(double* values, const double* of_colours) noexcept nogil
 cdef double largest(const double* values, Py_ssize_t count) noexcept nogil
 cdef double factorial(int i) noexcept nogil

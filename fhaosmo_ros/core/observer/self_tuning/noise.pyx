@@ -36,14 +36,13 @@ cdef double ROUGH_SAMPLES = 100.0  # squared differences of y are averaged over 
 # a sample some microseconds late, by a little more or less for dozens of samples, and a y that is
 # taken to be free of that would make a d of it.
 cdef double PROMPT = 0.02
-# Where the highest differences of y are more than FLAT times those of the order below, as
-# variances of white noise, they are noise, of at least FLAT^2 times that variance: what is smooth
-# has far smaller ones.
-cdef double FLAT = 0.5
 cdef double ROUNDED = 1e-12  # what is less than this part of a number may be an error of 64 bits
 cdef double LEAST = 1e-150  # noise: its square is not 0
 cdef double MEDIAN = 0.6745  # of |x| where x is normal with variance 1
-cdef double ROUGH = 2.0  # the variance of the noise is at most so many times what they say
+# The variance of the noise is at most so many times what differences of y say. Where the highest
+# ones are not so many times smaller than those of the order below, as variances of white noise,
+# they are noise, for what is smooth has far smaller ones; then it is at least 1 / ROUGH^2 of them.
+cdef double ROUGH = 2.0
 
 
 cdef bint is_multiple(double step, double quantum, double y) noexcept nogil:
@@ -315,8 +314,8 @@ cdef VECTORISED follow_noise(Members* m) noexcept nogil:
         m.late[c] = share_of_stamps(m, m.late[c], by_stamps)
         m.noise[c] = fmax(fmin(m.noise[c], ROUGH * most), sample.floor)
         rest = bound_of_noise(m, c, m.n + 1)
-        if rest > FLAT * bound_of_noise(m, c, m.n):
-            m.noise[c] = fmax(m.noise[c], FLAT * FLAT * rest)
+        if ROUGH * rest > bound_of_noise(m, c, m.n):
+            m.noise[c] = fmax(m.noise[c], rest / (ROUGH * ROUGH))
     fill_noise(m)
 
 

@@ -376,7 +376,7 @@ cdef class SelfTuning(Structure):
         cdef Shared* shared = &m.shared
         cdef double of_colours[COLOURS]
         cdef double mean = self.memory.period if self.memory.period > 0.0 else h, ratio, limit
-        cdef double slowed = 1.0
+        cdef double noisiest = shared.first_noise, slowed
         cdef int g, c, moving = 0
         cdef bint changed
         if not same:
@@ -399,9 +399,8 @@ cdef class SelfTuning(Structure):
             shared.unsettled, shared.steady_period = 0.0, mean
         shared.unsettled += h
         for c in range(COLOURS):
-            slowed = fmin(
-                slowed, pow(shared.first_noise / m.used_noise[c], 0.5 / (self.order + 1))
-            )
+            noisiest = fmax(noisiest, m.used_noise[c])
+        slowed = pow(shared.first_noise / noisiest, 0.5 / (self.order + 1))
         for c in range(BANDS):
             g = HALF + c * IN_BAND
             if m.kappa[g] / DECAY * slowed * shared.unsettled < FADED:

@@ -7,7 +7,7 @@ from libc.string cimport memset
 from fhaosmo_ros.core.observer.self_tuning.jumps cimport watch
 from fhaosmo_ros.core.observer.self_tuning.members cimport (
     BAND_STEP, COLOURS, COUNT, DECAY, FIRST_SAMPLES, GRID, HALF, HUBER, ORDERS, Estimates,
-    Line, Members, Shared, Work, entry, factorial, fill, largest, pair, power
+    Line, Members, Shared, Work, entry, factorial, fill, largest, leeway, pair, power
 )
 from fhaosmo_ros.core.observer.self_tuning.noise cimport (
     FADED, ROUNDED, find_noise, follow_differences
@@ -126,12 +126,11 @@ cdef VECTORISED judge(Members* m, bint counts) noexcept nogil:
     """
     Take a sample into the log-likelihoods, and bound the innovations (D 27, D 28), in place.
 
-    If it does not count, the log-likelihoods stay. Samples in a row that are far off a member are
-    not outliers, but its fault.
+    If it does not count, the log-likelihoods stay.
     """
     cdef Work* w = &m.work
     cdef Py_ssize_t g, active = m.shared.active
-    cdef double grown = m.shared.grown, kept = KEPT, late, likelihood, most, limit
+    cdef double grown = m.shared.grown, kept = KEPT, likelihood, most, limit
     cdef double logs[COLOURS]
     for g in range(active):
         w.ratio[g] = w.b[g] * w.b[g] / (w.s[g] * w.noise[g])
@@ -141,16 +140,14 @@ cdef VECTORISED judge(Members* m, bint counts) noexcept nogil:
             logs[g] = log(w.now[g] / m.shared.first_noise)
         fill(w.one, logs)
         for g in range(active):
-            late = m.far[g] - 1.0 if m.far[g] > 1.0 else 0.0
-            most = HUBER * HUBER * (1.0 + late * late)
+            most = HUBER * HUBER * leeway(m.far[g])
             likelihood = w.ratio[g] / grown
             likelihood = likelihood if likelihood < most else most
             likelihood += m.log_variance[g] + w.one[g]
             m.score[g] = m.prior[g] + kept * (m.score[g] - m.prior[g]) - 0.5 * likelihood
     for g in range(active):
         if w.ratio[g] > HUBER * HUBER:
-            late = m.far[g] - 1.0 if m.far[g] > 1.0 else 0.0  # in a row: not an outlier, but d
-            limit = HUBER * sqrt(w.s[g] * w.noise[g]) * (1.0 + late * late)
+            limit = HUBER * sqrt(w.s[g] * w.noise[g]) * leeway(m.far[g])
             w.b[g] = limit if w.b[g] > limit else -limit if w.b[g] < -limit else w.b[g]
 
 
@@ -182,16 +179,15 @@ cdef void tell_model(Members* m, bint jumped, Model* model) noexcept nogil:
     dense where the member's bandwidth ends.
     """
     cdef Shared* shared = &m.shared
-    cdef int g, k
-    cdef double noise, a, twice, edge, h = m.work.sample.h
+    cdef int g, k, levels
+    cdef double noise, a, edge
     if 2.0 * m.score[shared.told] < -FADED:
         shared.told = shared.likeliest
     g = shared.told
     k, noise, a = GRID.order[g], m.work.now[GRID.colour[g]], m.correlation[g]
-    twice = 2.0 * (m.n + 1 + k)
-    model.drive, model.loss = m.drive[k][g], m.kappa[g]
-    edge = fmin(pow(model.drive / noise * power(h, 2 * (m.n + 1 + k) - 1), 1.0 / twice), M_PI)
-    model.noise = noise / (1.0 + a * (a - 2.0 * cos(edge)))
+    model.drive, model.loss, levels = m.drive[k][g], m.kappa[g], m.n + 1 + k
+    edge = pow(model.drive / noise * power(m.work.sample.h, 2 * levels - 1), 0.5 / levels)
+    model.noise = noise / (1.0 + a * (a - 2.0 * cos(fmin(edge, M_PI))))
     model.derivatives = k - ORDERS if jumped else k
 
 
