@@ -55,8 +55,6 @@ cdef struct Sample:
     double roughness  # square of its difference over the usual one
     double roughness_before  # mean of those before
     double uneven  # square of the highest difference, as a variance of y, and of its stamps
-    double irregular  # square of the change of the interval (s^2)
-    double floor  # the least that the variance of the noise can be
     double largest  # variance of the innovations with which a member can judge it
     double average  # number of samples to average the noise over
 
@@ -83,7 +81,7 @@ cdef struct Work:
     Sample sample
     double now[COLOURS]  # variance of the noise of each colour at this sample
     int first, last  # members whose covariances move, and the one behind them
-    double q_interval, q_white, q_jerk  # what `q` holds for: h and two intensities,
+    double q_interval  # what `q` holds for: h (0: nothing yet),
     int q_first, q_last  # and members
 
 

@@ -174,12 +174,9 @@ cdef VECTORISED integrate_drive(Members* m) noexcept nogil:
     cdef double powers[MOST_STATES]
     cdef double* row
     cdef double h = w.sample.h, q
-    # All other intensities follow from these two (D 26).
-    if (w.q_interval == h and w.q_white == m.drive[0][0] and w.q_jerk == m.drive[3][COUNT - 1]
-            and w.q_first <= w.first and w.last <= w.q_last):
+    if w.q_interval == h and w.q_first <= w.first and w.last <= w.q_last:
         return
-    w.q_interval, w.q_white, w.q_jerk = h, m.drive[0][0], m.drive[3][COUNT - 1]
-    w.q_first, w.q_last = w.first, w.last
+    w.q_interval, w.q_first, w.q_last = h, w.first, w.last
     powers[0] = 1.0  # h^j / j!
     for i in range(1, d):
         powers[i] = powers[i - 1] * h / i

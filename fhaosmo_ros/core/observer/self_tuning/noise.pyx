@@ -203,14 +203,12 @@ cdef void follow_stamps(Members* m, double interval, double change) noexcept nog
     """
     Follow what changes of the interval say that the variance of the stamps is at most (D 29).
 
-    Whole periods of lost samples do not count. In the sample, `irregular` is the square of what
-    its own stamp may be off by, and `roughness` counts it, too: a single late stamp is seen there
-    at once.
+    Whole periods of lost samples do not count. `roughness` of the sample counts it, too: a single
+    late stamp is seen there at once.
     """
     cdef Shared* shared = &m.shared
     cdef Sample* sample = &m.work.sample
     cdef double least = EXACT * shared.steady_period, r
-    sample.irregular = change * change
     change -= (periods(m, interval) - periods(m, interval - change)) * shared.usual_interval
     r = change * change / (6.0 * shared.jitter)  # three stamps, one of them twice: 1 + 4 + 1
     sample.roughness = fmax(sample.roughness, r)
@@ -279,6 +277,7 @@ cdef VECTORISED follow_noise(Members* m) noexcept nogil:
     cdef double squares[COLOURS]
     cdef double variance, ratio, off, weight, most, more, share, rest, by_stamps
     cdef double average = sample.average, widest = sample.largest
+    cdef double floor = fmax(sample.quanta, EXACT * EXACT * m.rough[0][0][1])
     cdef int c
     cdef Py_ssize_t g, active = m.shared.active
     for g in range(active):
@@ -312,7 +311,7 @@ cdef VECTORISED follow_noise(Members* m) noexcept nogil:
         by_stamps = least_rough(m, 1, c)
         most = fmin(least_rough(m, 0, c), by_stamps)
         m.late[c] = share_of_stamps(m, m.late[c], by_stamps)
-        m.noise[c] = fmax(fmin(m.noise[c], ROUGH * most), sample.floor)
+        m.noise[c] = fmax(fmin(m.noise[c], ROUGH * most), floor)
         rest = bound_of_noise(m, c, m.n + 1)
         if ROUGH * rest > bound_of_noise(m, c, m.n):
             m.noise[c] = fmax(m.noise[c], rest / (ROUGH * ROUGH))

@@ -239,8 +239,7 @@ cdef class SelfTuning(Structure):
         sample.average = fmin(shared.samples, NOISE_SAMPLES)
         speed = self.look(h, u)
         late = fabs(speed * change) if memory.beyond == 0.0 and not even else 0.0
-        sample.uneven += fmax(shared.jitter, sample.irregular) * speed * speed
-        sample.floor = fmax(sample.quanta, EXACT * EXACT * m.rough[0][0][1])
+        sample.uneven += fmax(shared.jitter, change * change) * speed * speed
         shared.samples = <int>sample.average + 1
         goes_on = (
             memory.beyond > 0.0 and (sample.off < 0.0) == (memory.miss < 0.0)

@@ -71,7 +71,7 @@ cdef void begin(Members* m, double noise) noexcept nogil:
     cdef int n = m.n, g, i, j, k, below, c
     find_sizes(m)
     shared.active = COUNT
-    shared.unsettled = shared.flow_period = 0.0
+    shared.unsettled = shared.flow_period = m.work.q_interval = 0.0
     shared.first_noise = noise * noise
     for c in range(COLOURS):
         m.used_noise[c] = noise * noise
