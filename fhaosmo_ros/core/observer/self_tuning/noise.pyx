@@ -385,7 +385,6 @@ cdef double find_noise(Members* m) noexcept nogil:
     cdef Shared* shared = &m.shared
     cdef double found[DIFFERENCES]
     cdef double values[DIFFERENCES][FIRST_SAMPLES]
-    cdef double rough[CLOCKS][DIFFERENCES]
     cdef double ages[CLOCKS][FIRST_SAMPLES]
     cdef double quantum, noise = INFINITY, by_stamps = INFINITY, size = 0.0, period = 0.0, least
     cdef int order, most, i, c, clock
@@ -394,10 +393,8 @@ cdef double find_noise(Members* m) noexcept nogil:
     least, quantum = fmax(1e-9 * size, LEAST), find_quantum(m.first_y, ROUNDED * size)
     for i in range(1, FIRST_SAMPLES):
         period += m.first_h[i] / (FIRST_SAMPLES - 1)
-        values[0][i - 1] = fabs(m.first_h[i] - m.first_h[i - 1])
+        values[0][i - 1], values[1][i - 1] = fabs(m.first_h[i] - m.first_h[i - 1]), m.first_h[i]
     size = median(values[0] + 1, FIRST_SAMPLES - 2) / MEDIAN
-    for i in range(1, FIRST_SAMPLES):
-        values[1][i - 1] = m.first_h[i]
     shared.steady_period = period
     shared.usual_interval = median(values[1], FIRST_SAMPLES - 1)
     if values[1][FIRST_SAMPLES // 4] < 0.5 * period:
@@ -415,7 +412,7 @@ cdef double find_noise(Members* m) noexcept nogil:
                 values[order][i] = fabs(found[order])
         for order in range(1, m.n + 2):
             size = median(values[order], FIRST_SAMPLES - order) / MEDIAN
-            rough[clock][order] = size * size
+            m.rough[clock][0][order] = size * size
             if size > 0.0:
                 noise = fmin(noise, size)
                 if clock:
@@ -429,10 +426,9 @@ cdef double find_noise(Members* m) noexcept nogil:
         noise = quantum if quantum < INFINITY else least
     noise = fmax(noise, least)
     for clock in range(CLOCKS):
-        rough[clock][0] = 0.0
         for order in range(m.n + 2):
             for c in range(COLOURS):
-                m.rough[clock][c][order] = fmax(rough[clock][order], noise * noise)
+                m.rough[clock][c][order] = fmax(m.rough[clock][0][order], noise * noise)
     for c in range(COLOURS):
         m.noise[c] = noise * noise
         m.late[c] = share_of_stamps(m, 1.0, by_stamps * by_stamps)

@@ -90,7 +90,6 @@ cdef class SelfTuning(Structure):
         if self.block == NULL:
             raise MemoryError
         self.members = <Members*>((<size_t>self.block // CACHE_LINE + 1) * CACHE_LINE)
-        self.members.n = self.order
 
     def __dealloc__(self):
         free(self.block)
@@ -110,8 +109,8 @@ cdef class SelfTuning(Structure):
 
     cdef void begin_afresh(self) noexcept nogil:
         """Let the members begin afresh, by the next samples."""
-        memset(&self.members.shared, 0, sizeof(Shared))
-        self.memory.beyond = 0.0
+        memset(self.members, 0, sizeof(Members))
+        self.members.n, self.memory.beyond = self.order, 0.0
 
     cdef bint is_noisy(self, double y) noexcept nogil:
         """Return True if all differences of y show noise, so that it does not repeat itself."""

@@ -2,12 +2,11 @@
 """The members begin; how likely each of them is, and the mean of all (D 28, D 34)."""
 
 from libc.math cimport INFINITY, M_PI, NAN, cos, exp, fabs, fmin, isfinite, log, pow, sqrt
-from libc.string cimport memset
 
 from fhaosmo_ros.core.observer.self_tuning.jumps cimport watch
 from fhaosmo_ros.core.observer.self_tuning.members cimport (
-    BAND_STEP, COLOURS, COUNT, DECAY, FIRST_SAMPLES, GRID, HALF, HUBER, ORDERS, Estimates,
-    Line, Members, Shared, Work, entry, factorial, fill, largest, leeway, pair, power
+    BAND_STEP, COLOURS, COUNT, DECAY, FIRST_SAMPLES, GRID, HALF, HUBER, ORDERS, Members,
+    Shared, Work, entry, factorial, fill, largest, leeway, pair, power
 )
 from fhaosmo_ros.core.observer.self_tuning.noise cimport (
     FADED, ROUNDED, find_noise, follow_differences
@@ -64,14 +63,13 @@ cdef void find_sizes(Members* m) noexcept nogil:
 
 
 cdef void begin(Members* m, double noise) noexcept nogil:
-    """Let the members begin at the last sample (D 28)."""
+    """Let the members begin at the last sample (D 28); all else of `Members` is 0."""
     cdef Shared* shared = &m.shared
     cdef double y = m.first_y[FIRST_SAMPLES - 1], period = shared.steady_period
     cdef double omega, kappa, intensity, size, least = INFINITY, sizes = 0.0
     cdef int n = m.n, g, i, j, k, below, c
     find_sizes(m)
     shared.active = COUNT
-    shared.unsettled = shared.flow_period = m.work.q_interval = 0.0
     shared.first_noise = noise * noise
     for c in range(COLOURS):
         m.used_noise[c] = noise * noise
@@ -79,18 +77,11 @@ cdef void begin(Members* m, double noise) noexcept nogil:
         c, omega = GRID.colour[g], GRID.bandwidth[g] / period
         m.kappa[g], m.correlation[g] = DECAY * omega, GRID.correlation[c]
         m.tau[g] = -period / log(GRID.correlation[c]) if c > 0 else 0.0
-    memset(m.difference, 0, sizeof(m.difference))
     for j in range(n + 2):
         m.latest_y[j], m.ages[j] = m.first_y[0], j * period
     shared.roughness = 1.0
     for j in range(1, FIRST_SAMPLES):
         follow_differences(m, m.first_y[j], m.first_h[j])
-    memset(m.flow, 0, sizeof(m.flow))  # of members that were lost it may be anything
-    memset(m.decayed, 0, sizeof(Line))
-    memset(&m.gain, 0, sizeof(Estimates))
-    memset(&m.x, 0, sizeof(Estimates))
-    memset(&m.p, 0, sizeof(m.p))
-    memset(m.drive, 0, sizeof(m.drive))
     for g in range(COUNT):
         omega, kappa, k = GRID.bandwidth[g] / period, m.kappa[g], GRID.order[g]
         intensity = noise * noise * period * power(omega, 2 * (n + 1 + k))
