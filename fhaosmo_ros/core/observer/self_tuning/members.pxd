@@ -98,6 +98,7 @@ cdef struct Shared:
     double usual_interval  # between samples that were not stamped late (s)
     double flow_period  # interval that the flow is that of (s)
     double first_noise  # variance of the noise when the members began
+    double first_period  # mean interval of the first samples (s)
     double roughness  # short mean of the squared differences of y, over their usual size
     double grown  # how much larger than expected innovations and differences are of late, >= 1
     double jitter  # variance that the intervals of late say the stamps have at most (s^2)
@@ -119,7 +120,6 @@ cdef struct Shared:
 cdef struct Members:
     # Lines come first, so that they begin where vectors of the processor do.
     Line kappa  # rate at which d decays (1/s)
-    Line tau  # correlation time of the noise (s); 0: white
     Line correlation  # a, of samples a period apart
     Line decayed  # exp(-kappa h)
     Line drive[ORDERS]  # intensity q, in the row of the member's k; 0 elsewhere

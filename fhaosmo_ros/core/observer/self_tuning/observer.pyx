@@ -381,7 +381,7 @@ cdef class SelfTuning(Structure):
             for g in range(HALF):  # kappa does not depend on k
                 m.decayed[g] = m.decayed[g - 1] if GRID.order[g] > 0 else exp(-m.kappa[g] * h)
             for c in range(COLOURS):
-                of_colours[c] = exp(-h / m.tau[GRID.first[c]]) if c > 0 else 0.0
+                of_colours[c] = pow(GRID.correlation[c], h / shared.first_period)
             for g in range(HALF, COUNT):
                 m.decayed[g] = m.decayed[GRID.white[g]]
                 m.correlation[g] = of_colours[GRID.colour[g]]
@@ -459,7 +459,7 @@ cdef class SelfTuning(Structure):
         cdef Members* m = self.members
         n = self.order
         found = {
-            'kappa': <size_t>m.kappa, 'tau': <size_t>m.tau, 'weight': <size_t>m.weight,
+            'kappa': <size_t>m.kappa, 'weight': <size_t>m.weight,
             'correlation': <size_t>m.correlation, 'decayed': <size_t>m.decayed,
             'prior': <size_t>m.prior, 'score': <size_t>m.score, 'far': <size_t>m.far,
             'variance': <size_t>m.variance, 'log_variance': <size_t>m.log_variance,

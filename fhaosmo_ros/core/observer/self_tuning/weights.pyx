@@ -70,13 +70,12 @@ cdef void begin(Members* m, double noise) noexcept nogil:
     cdef int n = m.n, g, i, j, k, below, c
     find_sizes(m)
     shared.active = COUNT
-    shared.first_noise = noise * noise
+    shared.first_noise, shared.first_period = noise * noise, period
     for c in range(COLOURS):
         m.used_noise[c] = noise * noise
     for g in range(COUNT):
         c, omega = GRID.colour[g], GRID.bandwidth[g] / period
         m.kappa[g], m.correlation[g] = DECAY * omega, GRID.correlation[c]
-        m.tau[g] = -period / log(GRID.correlation[c]) if c > 0 else 0.0
     for j in range(n + 2):
         m.latest_y[j], m.ages[j] = m.first_y[0], j * period
     shared.roughness = 1.0
