@@ -34,7 +34,7 @@ VARIANTS, SCHEMES = ('sign', 'fuzzy', 'fuzzy_adaptive'), ('explicit', 'implicit'
 SELF_TUNING_BARS = {'paper_plant': 12.0, 'dc_motor': 12.0, 'pendulum': 100.0}  # us a step
 NOISE = 1e-4  # of y, where the file has no quantum
 PARTS = ('z_hat', 'z_tilde', 'p', 'q', 'gamma', 'y', 'pending')  # of a state in reference.c
-LAW = ('rate', 'min', 'max', 'dead_zone', 'leakage')  # parameters of gamma, at the end of its law
+LAW = ('rate', 'min', 'dead_zone', 'leakage')  # parameters of gamma, at the end of its law
 
 
 def measure(quick: bool) -> list[Row]:

@@ -14,7 +14,7 @@ enum { N = 4, SIZE = 4 * N + 3, KNOTS = 193 };
 struct law {
     double lambda[N], alpha[N], inverse_width[N];
     double curves[2][KNOTS];
-    double epsilon, gamma_initial, rate, min, max, dead_zone, leakage;
+    double epsilon, gamma_initial, rate, min, dead_zone, leakage;
 };
 
 static int step(const struct law *law, double *state, double y, double h, double *eps)
@@ -82,8 +82,8 @@ static int step(const struct law *law, double *state, double y, double h, double
     if (g <= law->min) {
         g = law->min;
         word |= 16;
-    } else if (g >= law->max) {
-        g = law->max;
+    } else if (g >= 1.0) {
+        g = 1.0;
         word |= 32;
     }
     x[4 * N] = g;
