@@ -60,15 +60,17 @@ cdef bint has_jumped(Members* m, double beyond) noexcept nogil:
     """
     cdef Shared* shared = &m.shared
     cdef Sample* sample = &m.work.sample
-    cdef double off = fabs(sample.off), uneven, hidden, jump, noise, least
+    cdef double off = fabs(sample.off), uneven, hidden, jump, noise
     cdef int count = <int>fmin(beyond, LOST_SAMPLES)
     if count == 0:
         begin_growth(m)
     shared.uneven += (sample.uneven - shared.uneven) / (count + 1.0)
     uneven = sqrt(shared.uneven)
     noise = HUBER * sqrt(m.work.now[0])
-    least = fmax(FARTHER * shared.first_off + noise, growth(m) * shared.latest_off - noise)
-    if count > 0 and off > fmax(SMOOTH * uneven, least):
+    if (
+        count > 0 and off > SMOOTH * uneven and off > FARTHER * shared.first_off + noise
+        and off > growth(m) * shared.latest_off - noise
+    ):
         shared.growing += 1.0
     else:
         shared.growing = 0.0
