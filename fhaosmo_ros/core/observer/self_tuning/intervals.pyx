@@ -7,7 +7,7 @@ the truncated one has (Curry, Vander Velde and Potter 1970, IEEE Transactions on
 16, 152-161).
 """
 
-from libc.math cimport INFINITY, M_2_PI, M_PI, copysign, erf, exp, fabs, fmax, fmin, log, sqrt
+from libc.math cimport M_2_PI, M_PI, copysign, erf, exp, fabs, fmax, fmin, log, sqrt
 from libc.stdlib cimport calloc, free
 
 from fhaosmo_ros.core.observer.self_tuning.members cimport (
@@ -32,13 +32,12 @@ cdef double OF_BACK = 3.0
 cdef double LEAST_CHANCE = -0.5 * HUBER * HUBER, LEAST_PASSAGE = 2.0 * LEAST_CHANCE
 # That probability is so small that it has to be found from the speed if z_1 moves, squared, by
 # less than this part of its variance.
-cdef double SLOW = 0.25
+cdef double SLOW = 0.1
 # A repeated sample counts for what is less likely than this, and for z_1 not passing an edge.
 cdef double HALF_SURE = log(0.5)
-# A normal number with the variance of an even distribution in the interval lies in it with the
-# first probability. So a sample that repeats the one before, and that a member expects with more
-# than the second one, tells it nothing: each such sample would narrow it again.
-cdef double EVENLY = log(erf(sqrt(1.5))), KNOWN = log(0.88)
+# A normal number with the variance of an even distribution in the interval lies in it with this
+# probability.
+cdef double EVENLY = log(erf(sqrt(1.5)))
 
 
 # The normal distribution by additions and multiplications alone, which become vector instructions:
@@ -75,7 +74,7 @@ cdef inline double mills(double x) noexcept nogil:
 
 # What a sample tells
 
-cdef VECTORISED truncate(Members* m, double half, double least, bint repeated) noexcept nogil:
+cdef VECTORISED truncate(Members* m, double half, double least) noexcept nogil:
     """
     Find what is known of the members' z_1 if it lies within `half` a quantum of a sample.
 
@@ -87,7 +86,7 @@ cdef VECTORISED truncate(Members* m, double half, double least, bint repeated) n
     cdef Work* w = &m.work
     cdef double inverse, off, width, near, far, to_near, left, right, beyond, share, by_near
     cdef double center, less, square
-    cdef double known = KNOWN if repeated else INFINITY, tail = GATE
+    cdef double tail = GATE
     cdef Py_ssize_t g, active = m.shared.active
     for g in range(active):
         w.size[g] = sqrt(INEXACT * (w.p.zz[0][g] + least))
@@ -124,11 +123,12 @@ cdef VECTORISED truncate(Members* m, double half, double least, bint repeated) n
         share = (log(w.chance[g]) if w.chance[g] != 1.0 else 0.0) - 0.5 * w.one[g]
         w.chance[g] = share if share > LEAST_CHANCE else LEAST_CHANCE
     for g in range(active):
+        m.far[g] = m.far[g] + 1.0 if w.one[g] > tail * tail else 0.0
         off = HUBER * leeway(m.far[g])
         center = w.mean[g] if w.mean[g] > -off else -off
         center = center if center < off else off
-        w.b[g] = center * w.size[g] if w.chance[g] <= known else 0.0
-        w.inverse[g] = 1.0 / (w.size[g] * w.size[g]) if w.chance[g] <= known else 0.0
+        w.b[g] = center * w.size[g]
+        w.inverse[g] = 1.0 / (w.size[g] * w.size[g])
         w.taken[g] = w.lost[g] * w.inverse[g]
 
 
@@ -150,22 +150,36 @@ cdef inline double passage(
 cdef VECTORISED stay(
     Members* m, const double* speed, double half, double least, double carried
 ) noexcept nogil:
-    """Bound `chance` of a sample that comes again by that of z_1 passing neither edge (D 36)."""
+    """
+    Let a sample that comes again tell that z_1 has passed neither edge (D 36).
+
+    That z_1 is in the interval was known before: who takes it for news at each sample is soon sure
+    of something wrong. So the sample corrects a member by the share that the log-likelihood of
+    passing neither edge has in that of the interval; and at least until the variance of z_1 is
+    what it can be within two edges (Popoviciu 1935).
+    """
     cdef Work* w = &m.work
-    cdef double before = w.sample.before, h = w.sample.h
-    cdef double z, moved, variance, up, down, chance, spread
+    cdef double before = w.sample.before, h = w.sample.h, most = half * half
+    cdef double z, moved, variance, spread, passed, chance, share, least_share
     cdef bint slow
     cdef Py_ssize_t g, active = m.shared.active
     for g in range(active):
         z, variance = m.x.z[0][g], m.p.zz[0][g] + least
         moved = w.x.z[0][g] - z
-        spread = h * h * speed[g]
-        up = passage(before + half - z, variance, moved, spread + carried)
-        down = passage(z + half - before, variance, -moved, spread + carried)
+        spread = h * h * speed[g] + carried
+        passed = passage(before + half - z, variance, moved, spread)
+        passed += passage(z + half - before, variance, -moved, spread)
         slow = moved * moved + spread < SLOW * variance
+        passed = passed if slow else 0.0
         chance = w.chance[g] - (HALF_SURE if slow else EVENLY)  # who expects it loses nothing
-        up = -(up + down) if slow else 0.0
-        w.chance[g] = chance if chance < up else up
+        chance = chance if chance < -passed else -passed
+        share = chance / w.chance[g] if w.chance[g] < chance else 1.0
+        least_share = (1.0 - most * w.inverse[g]) / w.lost[g] if w.lost[g] > 0.0 else 0.0
+        share = share if share > least_share else least_share
+        share = share if share < 1.0 else 1.0
+        w.b[g] *= share
+        w.taken[g] *= share
+        w.chance[g] = chance
 
 
 cdef VECTORISED go_on(
@@ -180,8 +194,8 @@ cdef VECTORISED go_on(
     for g in range(active):
         z, variance = m.x.z[0][g], m.p.zz[0][g] + least
         moved = side * (w.x.z[0][g] - z)
-        spread = h * h * speed[g]
-        passed = passage(side * (before - z) + half, variance, moved, spread + carried)
+        spread = h * h * speed[g] + carried
+        passed = passage(side * (before - z) + half, variance, moved, spread)
         passed = passed if passed < 1.0 else 1.0
         w.one[g] = passed if moved * moved + spread < SLOW * variance else 1.0
     for g in range(active):
@@ -203,11 +217,7 @@ cdef VECTORISED take_interval(Members* m) noexcept nogil:
     cdef double least = fmax(w.now[0] - w.sample.quanta, 0.0) + vague * vague
     cdef double carried = 2.0 * fmin(OF_BACK * m.shared.goes_back, 1.0) * least
     cdef double* speed = entry(&m.p, m.n, 1, 1)  # variance of the state behind z_1
-    for g in range(active):
-        m.far[g] = (
-            m.far[g] + 1.0 if w.b[g] * w.b[g] > GATE * GATE * w.s[g] * w.now[0] else 0.0
-        )
-    truncate(m, half, least, y == before)
+    truncate(m, half, least)
     if y == before:
         stay(m, speed, half, least, carried)
     elif fabs(y - before) < 3.0 * half:
@@ -264,7 +274,7 @@ def within(double low, double high):
         raise MemoryError
     m.n = m.shared.active = 1
     m.work.b[0], m.work.p.zz[0][0] = 0.5 * (low + high), 1.0
-    truncate(m, 0.5 * (high - low), 0.0, False)
+    truncate(m, 0.5 * (high - low), 0.0)
     found = m.work.chance[0], m.work.mean[0], m.work.lost[0]
     free(m)
     return found
