@@ -7,7 +7,7 @@ the truncated one has (Curry, Vander Velde and Potter 1970, IEEE Transactions on
 16, 152-161).
 """
 
-from libc.math cimport M_2_PI, M_PI, copysign, erf, exp, fabs, fmax, fmin, log, sqrt
+from libc.math cimport M_2_PI, M_PI, copysign, erf, exp, fabs, fmax, log, sqrt
 from libc.stdlib cimport calloc, free
 
 from fhaosmo_ros.core.observer.self_tuning.members cimport (
@@ -24,9 +24,6 @@ cdef double FARTHEST = 12.0  # standard deviations; numbers that are farther off
 # Part of the quantum by which predictions of z_1 are less certain than their P says. In an
 # interval of twice so few standard deviations the density is taken to be constant.
 cdef double VAGUE = 0.1
-# If more than one in so many of y's steps go back at once, noise of as much as VAGUE carries z_1
-# over edges. Innovations do not show noise that is far smaller than the quantum.
-cdef double OF_BACK = 3.0
 # Logarithms of the least probability that a sample counts with, by HUBER as without quanta, and of
 # the least one with which z_1 passes an edge at just this sample.
 cdef double LEAST_CHANCE = -0.5 * HUBER * HUBER, LEAST_PASSAGE = 2.0 * LEAST_CHANCE
@@ -215,7 +212,8 @@ cdef VECTORISED take_interval(Members* m) noexcept nogil:
     cdef double vague = 2.0 * VAGUE * half, kept = KEPT
     # Noise that is not of rounding, and what no P knows.
     cdef double least = fmax(w.now[0] - w.sample.quanta, 0.0) + vague * vague
-    cdef double carried = 2.0 * fmin(OF_BACK * m.shared.goes_back, 1.0) * least
+    # Noise that is far smaller than the quantum shows where it carries z_1 over an edge and back.
+    cdef double carried = 2.0 * m.shared.goes_back * least
     cdef double* speed = entry(&m.p, m.n, 1, 1)  # variance of the state behind z_1
     truncate(m, half, least)
     if y == before:
