@@ -15,11 +15,11 @@ from fhaosmo_ros.core.parameters.units import derivative_unit
 from fhaosmo_ros.inputs import known_inputs, measured_output
 from fhaosmo_ros.nodes.estimator.health import Health
 from fhaosmo_ros.nodes.estimator.outputs import estimate_messages
-from fhaosmo_ros.nodes.estimator.sources import Listener
+from fhaosmo_ros.nodes.estimator.sources import check_input, Listener
 from fhaosmo_ros.nodes.middleware.diagnostics import array_of, OK, QUIET, Report, WARN
-from fhaosmo_ros.nodes.middleware.endpoints import create_publisher, LATCHED, Listeners
+from fhaosmo_ros.nodes.middleware.endpoints import create_publisher, full_name, LATCHED, Listeners
 from fhaosmo_ros.nodes.middleware.messages import labelled, message_class, time_message
-from fhaosmo_ros.topics import estimates_of, EVENT, SNAPSHOT
+from fhaosmo_ros.topics import estimates_of, EVENT, SNAPSHOT, STANDARD_DEVIATION
 from std_msgs.msg import Float64MultiArray
 
 PERIOD, PERIOD_OF_SELF_TUNING = 1.0, 30.0
@@ -47,6 +47,9 @@ class Channel:
         self.measured = measured_output(values, name)
         self.known = known_inputs(values, self.estimator.observer.used_inputs, name)
         self.clock, self._active = node.get_clock(), False
+        for wanted in (self.measured, *self.known.values()):
+            check_input(node, wanted)
+        full_name(node, self.prefix + STANDARD_DEVIATION)  # its longest topic
 
     def open(self) -> None:
         """Make its topics, and listen to y and to the known inputs."""

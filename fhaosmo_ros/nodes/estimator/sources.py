@@ -6,7 +6,7 @@ The type of a topic is given, or found from the graph: then the subscription beg
 publishes a type that has a wanted field.
 """
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from copy import copy
 import math
 from time import time_ns
@@ -64,7 +64,6 @@ class Source:
     messages did not arrive, or were damaged, which the middleware drops. `delay` is the longest
     time from a publication to its callback between the latest two looks (ns), `offset` that from
     the latest header's stamp to its publication.
-    `on_names` is called with the names in each message.
     """
 
     def __init__(self, node: Node, sources: 'Sources', topic: str) -> None:
@@ -74,7 +73,6 @@ class Source:
         self.unheard: list[str] = []
         self.numbers, self.offset = endpoints.SequenceNumbers(), 0
         self.delay = self._delay = -math.inf
-        self.on_names: Callable[[Any], None] | None = None
         self.listeners: list[Listener] = []
         self._served: list[Listener] = []  # those with a field
         self._header = ''  # its name in a message
@@ -101,7 +99,7 @@ class Source:
             listener.find(types, message_type)
         self._served = [listener for listener in self.listeners if listener.field]
         self._header = next((li.field.header for li in self._served), '')
-        if self._subscription is None and (self._served or self.on_names):
+        if self._subscription is None and self._served:
             self.message_type = message_type
             self._subscription = endpoints.subscribe_with_info(
                 self._node, kind, self.topic, self._on_message, copy(endpoints.SENSOR_QOS),
@@ -129,8 +127,6 @@ class Source:
         published = info['source_timestamp']
         self._delay = max(self._delay, time_ns() - published)
         self.numbers.take(info)
-        if self.on_names is not None:
-            self.on_names(getattr(message, 'name', None))
         stamps = {'source': published, 'reception': info['received_timestamp']}
         if self._header:
             stamp = getattr(message, self._header).stamp
@@ -155,19 +151,18 @@ class Sources:
     message.
     """
 
-    def __init__(self, node: Node, on_type: Callable[[], None]) -> None:
-        self._node, self._on_type = node, on_type
+    def __init__(
+        self, node: Node, on_type: Callable[[], None], after_message: Callable[[], None]
+    ) -> None:
+        self._node, self._on_type, self.after_message = node, on_type, after_message
         self._by_topic: dict[str, Source] = {}
-        self.after_message: Callable[[], None] = lambda: None
 
     def add(self, wanted: Input, take: Take) -> Listener:
-        """Return a listener to an input; it hears a message after those that were added before."""
-        source = self.of(wanted)
-        source.listeners.append(Listener(wanted, take, source))
-        return source.listeners[-1]
+        """
+        Return a listener to an input; it hears a message after those that were added before.
 
-    def of(self, wanted: Input) -> Source:
-        """Return the source of an input, not open yet if new; raise for a second type of it."""
+        Raises ConfigurationError for a second type of a topic.
+        """
         topic, kind = self._node.resolve_topic_name(wanted.topic), wanted.message_type
         source = self._by_topic.setdefault(topic, Source(self._node, self, topic))
         if kind and source.message_type not in ('', kind):
@@ -176,7 +171,8 @@ class Sources:
                 f'{source.message_type} and {kind}'
             )
         source.message_type = source.message_type or kind
-        return source
+        source.listeners.append(Listener(wanted, take, source))
+        return source.listeners[-1]
 
     def open(self) -> None:
         """Subscribe to all of them, to each once its type is known."""
@@ -210,13 +206,12 @@ def find_wanted(types: Mapping[str, Any], wanted: Input, message_type: str) -> F
     return field
 
 
-def check_inputs(node: Node, inputs: Iterable[Input]) -> None:
-    """Raise ConfigurationError for names, types or fields that cannot be, as far as given."""
-    for wanted in inputs:
-        endpoints.full_name(node, wanted.topic, "parameters 'input_topic', 'known_input_topics': ")
-        if wanted.message_type:
-            try:
-                find_wanted(definitions(wanted.message_type), wanted, wanted.message_type)
-            except LookupError as error:
-                types = "parameter 'input_type' or 'known_input_types'"
-                raise ConfigurationError(f'{types}: {error}') from None
+def check_input(node: Node, wanted: Input) -> None:
+    """Raise ConfigurationError for a name, a type or a field that cannot be, as far as given."""
+    endpoints.full_name(node, wanted.topic, "parameters 'input_topic', 'known_input_topics': ")
+    if wanted.message_type:
+        try:
+            find_wanted(definitions(wanted.message_type), wanted, wanted.message_type)
+        except LookupError as error:
+            types = "parameter 'input_type' or 'known_input_types'"
+            raise ConfigurationError(f'{types}: {error}') from None

@@ -103,9 +103,13 @@ class BaseNode(Node):
     ) -> None:
         values = complete(given, NODE_TABLES[name])
         super().__init__(name, parameter_overrides=built_in(given), enable_logger_service=True)
+        values = self._with_channels(values)
         not_live = (p.name for p in values.table.values() if not p.live)
         self._read_only = set(not_live if fixed is None else fixed)
-        self.extend(values)
+        self.values = values
+        for key, value in values.items():
+            declared = descriptor(values.table[key], key in self._read_only)
+            self.declare_parameter(key, value, declared, ignore_override=True)
         self.add_pre_set_parameters_callback(self._look_at)
         self.add_post_set_parameters_callback(self._take_over)
 
@@ -126,13 +130,9 @@ class BaseNode(Node):
         take = take_time if msg_type is Clock else callback
         return super().create_subscription(msg_type, topic, take, *arguments, **options)
 
-    def extend(self, values: Parameters) -> None:
-        """Go on with values, perhaps of a larger table: what is new is declared."""
-        for name, value in values.items():
-            if not self.has_parameter(name):
-                declared = descriptor(values.table[name], name in self._read_only)
-                self.declare_parameter(name, value, declared, ignore_override=True)
-        self.values = values
+    def _with_channels(self, values: Parameters) -> Parameters:
+        """Return the values with those of channels whose names are not known before."""
+        return values
 
     def _look_at(self, parameters: list[RosParameter]) -> list[RosParameter]:
         """Coerce and prepare a set; return it, and those that follow, in the declared types."""
