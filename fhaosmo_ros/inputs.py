@@ -9,7 +9,7 @@ lists ``known_input_topics`` and so on.
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
-from fhaosmo_ros.core.parameters.per_channel import CHANNELS, FROM_JOINTS
+from fhaosmo_ros.core.parameters.per_channel import channel_names, FROM_JOINTS
 from fhaosmo_ros.core.parameters.tables import CHANNEL_PARAMETERS
 from fhaosmo_ros.messages.fields import JOINT_STATE
 from fhaosmo_ros.topics import FLOAT
@@ -23,8 +23,8 @@ class Input(NamedTuple):
     topic: str  # as the user wrote it: below the node's namespace, unless it begins with /
     message_type: str  # '' if it is the one that the topic has
     field: str  # '' for the only number
-    stamp: str  # auto, header, source or reception; of a known input reception
     name: str  # of the channel: the element of a list that is meant where the field has no index
+    stamp: str = 'reception'  # of y auto, header, source or reception
 
     def absolute(self, namespace: str) -> str:
         """Return the topic's full name in a namespace such as '/rig' ('' or '/' for none)."""
@@ -34,10 +34,9 @@ class Input(NamedTuple):
 
 
 def with_joints(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return values to which the topic and type are added that `FROM_JOINTS` stands for."""
+    """Return values, with the topic and type that `FROM_JOINTS` stands for."""
     result = dict(values)
-    names = values.get(CHANNELS)  # not checked yet
-    if ([names] if isinstance(names, str) else names) == FROM_JOINTS:
+    if channel_names(values) == FROM_JOINTS:
         for name, value in (('input_topic', 'joint_states'), ('input_type', JOINT_STATE)):
             result[name] = result.get(name) or value
     return result
@@ -46,7 +45,7 @@ def with_joints(values: Mapping[str, Any]) -> dict[str, Any]:
 def measured_output(values: Mapping[str, Any], channel: str = '') -> Input:
     """Return what y is, by the complete parameters of a channel; its name is '' without names."""
     parts = [values[f'input_{part}'] for part in PARTS]
-    return _input('y', *parts, values['input_stamp'], channel)
+    return _input('y', *parts, channel)._replace(stamp=values['input_stamp'])
 
 
 def known_inputs(
@@ -68,16 +67,13 @@ def known_inputs(
             )
         columns.append(given if len(given) == len(names) else given * len(names))
     return {
-        name: _input(name, *parts, 'reception', channel)
-        for name, *parts in zip(names, *columns, strict=True)
+        name: _input(name, *parts, channel) for name, *parts in zip(names, *columns, strict=True)
     }
 
 
-def _input(
-    name: str, topic: str, message_type: str, field: str, stamp: str, channel: str
-) -> Input:
+def _input(name: str, topic: str, message_type: str, field: str, channel: str) -> Input:
     """Return an input; one of which nothing is said is a Float64 on the topic of its name."""
     if not (topic or message_type or field):
         message_type = FLOAT
     below = f'{channel}/{name}' if channel else name
-    return Input(topic or below, message_type, field, stamp, channel)
+    return Input(topic or below, message_type, field, channel)
