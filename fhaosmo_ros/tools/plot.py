@@ -47,7 +47,7 @@ def main(argv: list[str] | None = None) -> int:
     )  # fmt: skip
     add('--force', action='store_true', help='replace an output that exists')
     add('--names', nargs='+', metavar='NAME', help='estimators (default: all in the bags)')
-    add('--plant', default='/plant', help='whose topics are the truth (default: %(default)s)')
+    add('--plant', metavar='NAME', help='whose topics are the truth (default: /plant, if any)')
     return run_command(parser, argv, _plot)
 
 
@@ -58,9 +58,11 @@ def _plot(arguments: argparse.Namespace, stop: Stop) -> None:
             f'--output: expected a name that ends in {", ".join(SUFFIXES)}, got {path}'
         )
     with stop.raising():
-        curves = [
-            c for bag in arguments.bags for c in read_curves(bag, arguments.names, arguments.plant)
-        ]
+        plant = arguments.plant or '/plant'
+        curves = [c for bag in arguments.bags for c in read_curves(bag, arguments.names, plant)]
+    if arguments.plant and all(c.truth is None for c in curves):
+        of_truth = ', '.join(f'{plant}/{part}' for part in TRUTH)
+        raise ConfigurationError(f'--plant: expected a bag with {of_truth}, got none')
     # Not within raising: it leaves nothing behind.
     with output_at(path, arguments.force) as figure, stop.raising():
         save_curves(curves, figure)

@@ -104,12 +104,13 @@ def output_at(final: Path, force: bool = False, *inputs: Path) -> Iterator[Path]
     It is complete when the block ends without an error; else nothing stays, and what was there
     before does. The path that is yielded has the final name, in a hidden folder beside its place,
     and does not exist yet. ConfigurationError if the place is in use, unless `force`: by a file,
-    or a folder that is not empty; `force` or not, by one of the inputs.
+    or a folder that is not empty; `force` or not, by one of the inputs, or a part of one.
     """
     if final.name in ('', '..'):  # nothing could be renamed to it
         raise ConfigurationError(f'output {final}: expected a name, got a folder that is in use')
+    place = final.resolve()
     for path in map(Path.resolve, inputs):
-        if final.resolve() in (path, *path.parents):
+        if place in (path, *path.parents) or (path in place.parents and place.exists()):
             raise ConfigurationError(
                 f'output {final}: expected another place than the input has, got that of {path}'
             )
