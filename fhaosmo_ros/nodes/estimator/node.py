@@ -139,7 +139,7 @@ class EstimatorNode(ManagedNode):
         for prefix, those in {**by_prefix, '~/': channels}.items():
             self.create_service(Trigger, f'{prefix}reset', partial(self._reset, those))
         self._channels = channels
-        self.sources.open()
+        self.sources.look()
         self._publish_parameters()
 
     def _publish_parameters(self) -> None:
@@ -210,8 +210,9 @@ class EstimatorNode(ManagedNode):
             clock = self.resolve_topic_name('/clock')
             state.find(ERROR, f'use_sim_time, but nothing on {clock} yet')
         reports = [state]
-        if active:
+        if self._channels:
             self.sources.look()
+        if active:
             for channel in self._channels:
                 reports += channel.health.reports()
             silent = (STALE, 'no usable samples')  # which is said of the input

@@ -17,10 +17,8 @@ from fhaosmo_ros.inputs import Input
 from fhaosmo_ros.messages.fields import Field, find_field, MissingElementError, Unwrapper
 from fhaosmo_ros.nodes.middleware import endpoints
 from fhaosmo_ros.nodes.middleware.messages import definitions, message_class
-from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 
-DISCOVERY_PERIOD = 0.2
 Take = Callable[[int, float], None]
 """Gets the stamp of a sample in nanoseconds, and its value."""
 
@@ -78,7 +76,7 @@ class Source:
         self._header = ''  # its name in a message
         self._subscription: Any = None
 
-    def open(self) -> bool:
+    def _open(self) -> bool:
         """Look for fields in the type, if it is known; return whether there is a subscription."""
         message_type = self.message_type
         if not message_type:
@@ -106,10 +104,14 @@ class Source:
                 qos_overriding_options=endpoints.OVERRIDABLE,
             )  # fmt: skip
 
-    def look(self) -> None:
-        """Look at the topic's publishers in the ROS graph; rclpy logs QoS that does not match."""
+    def look(self) -> bool:
+        """
+        Look at the topic's publishers in the ROS graph; return whether it has begun to listen.
+
+        rclpy logs QoS that does not match.
+        """
         if self._subscription is None:
-            return
+            return self._open()
         self.delay, self._delay = self._delay, -math.inf
         self.heard, self.unheard = [], []
         for endpoint in self._node.get_publishers_info_by_topic(self.topic):
@@ -122,6 +124,7 @@ class Source:
                     f'expected {self.message_type}'
                 )
         self.numbers.single = len(self.heard) <= 1
+        return False
 
     def _on_message(self, message: Any, info: Mapping[str, Any]) -> None:
         published = info['source_timestamp']
@@ -174,25 +177,11 @@ class Sources:
         source.listeners.append(Listener(wanted, take, source))
         return source.listeners[-1]
 
-    def open(self) -> None:
-        """Subscribe to all of them, to each once its type is known."""
-        self._closed = list(self._by_topic.values())
-        clock = Clock(clock_type=ClockType.STEADY_TIME)
-        self._timer = self._node.create_timer(DISCOVERY_PERIOD, self._discover, clock=clock)
-        self._discover()
-
-    def _discover(self) -> None:
-        before = len(self._closed)
-        self._closed = [source for source in self._closed if not source.open()]
-        if not self._closed:
-            self._node.destroy_timer(self._timer)
-        if len(self._closed) < before:
-            self._on_type()
-
     def look(self) -> None:
-        """Look at the publishers of all topics."""
-        for source in self._by_topic.values():
-            source.look()
+        """Subscribe to the topics whose type has become known; look at publishers of others."""
+        begun = [source.look() for source in self._by_topic.values()]
+        if any(begun):
+            self._on_type()
 
 
 def find_wanted(types: Mapping[str, Any], wanted: Input, message_type: str) -> Field:
