@@ -38,11 +38,6 @@ UNUSED = {
     'rejected inputs': '{n} known inputs rejected: expected finite numbers; the last one is held',
 }
 """What is said of the samples that were not used, by counter; `zero`: why stamps are 0."""
-UNUSUAL = {
-    'restarts': '{n} restarts: stamps jumped by more than max_gap; where y always comes so '
-    'slowly, set max_gap to several of its periods',
-}
-"""What is said of other counters of the input that have grown by `n`."""
 ZERO = {
     'clock': 'nothing on /clock yet',
     'header': 'their stamps are 0: nobody fills the header; input_stamp: source does without it',
@@ -134,9 +129,12 @@ class Health:
         report.find(WARN, f'{lacking} messages without y: {y.why}', lacking and not used)
         bad = sum(news[key] for key in UNUSED)
         zero = ZERO.get(stamps, 'their stamps are 0')
-        for key, text in (UNUSED | UNUSUAL).items():
-            many = key in UNUSED and bad > BAD_SHARE * (bad + used)
-            report.find(ERROR if many else WARN, text.format(n=news[key], zero=zero), news[key])
+        level = ERROR if bad > BAD_SHARE * (bad + used) else WARN
+        for key, text in UNUSED.items():
+            report.find(level, text.format(n=news[key], zero=zero), news[key])
+        restarts = f'{news["restarts"]} restarts: stamps jumped by more than max_gap; where y '
+        restarts += 'always comes so slowly, set max_gap to several of its periods'
+        report.find(WARN, restarts, news['restarts'])
         spread = news['spread stamps']
         ticks = f'/clock ticks once for {used / max(1, used - spread):.0f} samples'
         report.find(WARN, ticks, used < 2 * spread)
