@@ -9,7 +9,7 @@ from fhaosmo_ros.core.parameters.declaration import Parameter, Parameters, sugge
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.per_channel import BUILT_IN, complete, is_built_in, split
 from fhaosmo_ros.core.parameters.tables import NODE_TABLES
-from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor
+from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.exceptions import ParameterNotDeclaredException
 from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
@@ -22,8 +22,6 @@ POLICIES = {p.name: p for p in (
     Parameter('durability', '', '', choices=('volatile', 'transient_local')),
 )}  # fmt: skip
 """QoS policies that a user may override."""
-STEPS = 100.0
-"""Of a slider: none where one of them would exceed the default, as bounds then say nothing."""
 
 
 class RefusedError(ParameterNotDeclaredException):
@@ -42,12 +40,12 @@ def descriptor(parameter: Parameter, read_only: bool) -> ParameterDescriptor:
     Return the ROS descriptor of a declared parameter.
 
     Typing is dynamic so that a wrong type reaches our own check, whose message names the
-    parameter. Bounds are a ROS range only where a slider of rqt_reconfigure makes sense.
+    parameter, and so bounds are no ROS range.
     """
     constraints = [parameter.allowed, *filter(None, [parameter.lengths])]
     if not (parameter.live or read_only):
         constraints.append('fixed while the node is configured: set it after cleanup')
-    result = ParameterDescriptor(
+    return ParameterDescriptor(
         name=parameter.name,
         type=RosParameter.Type.from_parameter_value(parameter.default).value,
         description=parameter.text,
@@ -55,10 +53,6 @@ def descriptor(parameter: Parameter, read_only: bool) -> ParameterDescriptor:
         read_only=read_only,
         dynamic_typing=True,
     )
-    lower, upper = parameter.lower, parameter.upper
-    if parameter.kind == 'double' and upper - lower <= STEPS * parameter.default:
-        result.floating_point_range = [FloatingPointRange(from_value=lower, to_value=upper)]
-    return result
 
 
 def built_in(given: Mapping[str, Any]) -> list[RosParameter]:
