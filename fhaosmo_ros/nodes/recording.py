@@ -57,13 +57,13 @@ class PrivateNode(Spinner):
         self._client = cache(partial(AsyncParameterClient, node))  # by the name of its node
         super().__init__(node)
 
-    def set_parameters(self, node: str, values: Mapping[str, Any]) -> None:
-        """Ask another node to change parameters; what it answers is not waited for."""
-        self._client(node).set_parameters([Parameter(k, value=v) for k, v in values.items()])
-
-    def can_set_parameters(self, node: str) -> bool:
-        """Return whether a node offers its parameters; asked early, as clients may wait 3 s."""
-        return bool(self._client(node).services_are_ready())
+    def set_parameters(self, node: str, values: Mapping[str, Any]) -> bool:
+        """Ask a node to change parameters, if it is known yet; return whether it was asked."""
+        client = self._client(node)
+        if client.services_are_ready():
+            client.set_parameters([Parameter(k, value=v) for k, v in values.items()])
+            return True
+        return False
 
     def publisher(
         self, topic: str, message_type: str, transient_local: bool

@@ -138,9 +138,7 @@ def _record(
 
         deadline = time.monotonic() + START_DEADLINE
         print('waiting for the first estimate ...', flush=True)
-        while not all(recorder.counts[topic] for topic in compared) or (
-            noisy and not recorder.can_set_parameters('/plant')
-        ):
+        while not all(recorder.counts[topic] for topic in compared):
             check()
             if stop.wait(0.02):
                 raise Stopped('before the first estimate, nothing written')
@@ -157,10 +155,10 @@ def _record(
                 check()
                 elapsed = min(time.monotonic() - begin, duration)
                 bar.update(elapsed - bar.n)
-                if noisy and not marks and elapsed >= NOISY_FROM * duration:
+                due = noisy and not marks and elapsed >= NOISY_FROM * duration
+                if due and recorder.set_parameters('/plant', values):
                     bar.write(f'{elapsed:4.1f} s: {words}')
                     marks.append((time.time_ns(), words))
-                    recorder.set_parameters('/plant', values)
         return marks
 
 
