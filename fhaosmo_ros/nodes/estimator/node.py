@@ -132,22 +132,23 @@ class EstimatorNode(ManagedNode):
         self._timer = self.create_timer(1.0 / values['publish_rate'], self._tick)
         self._timer.cancel()
         self.typed = TypedOutputs(self, values)
-        self.sources = Sources(self, self._found_type, self.typed.publish)
+        self.sources = Sources(self, self.typed.publish)
         for channel in channels:
             channel.open()
         by_prefix = {channel.prefix: [channel] for channel in channels}
         for prefix, those in {**by_prefix, '~/': channels}.items():
             self.create_service(Trigger, f'{prefix}reset', partial(self._reset, those))
         self._channels = channels
-        self.sources.look()
+        self._look()
         self._publish_parameters()
 
     def _publish_parameters(self) -> None:
         text = parameter_text(self, self.values, self._channels)
         self._parameters_topic.publish(String(data=text))
 
-    def _found_type(self) -> None:
-        """Take dt from header stamps in simulated time, once those that are known are such."""
+    def _look(self) -> None:
+        """Look for y and u; in simulated time take dt from headers where all known y have one."""
+        self.sources.look()
         stamps = {channel.y.stamps for channel in self._channels if channel.y.stamps}
         if self._chooses_sampling and stamps == {'header'}:
             self._chooses_sampling = False
@@ -211,7 +212,7 @@ class EstimatorNode(ManagedNode):
             state.find(ERROR, f'use_sim_time, but nothing on {clock} yet')
         reports = [state]
         if self._channels:
-            self.sources.look()
+            self._look()
         if active:
             for channel in self._channels:
                 reports += channel.health.reports()

@@ -64,8 +64,8 @@ class Source:
     the latest header's stamp to its publication.
     """
 
-    def __init__(self, node: Node, sources: 'Sources', topic: str) -> None:
-        self._node, self._sources, self.topic = node, sources, topic
+    def __init__(self, node: Node, topic: str, after_message: Callable[[], None]) -> None:
+        self._node, self.topic, self._after_message = node, topic, after_message
         self.message_type = ''
         self.heard: list[str] = []
         self.unheard: list[str] = []
@@ -76,42 +76,35 @@ class Source:
         self._header = ''  # its name in a message
         self._subscription: Any = None
 
-    def _open(self) -> bool:
-        """Look for fields in the type, if it is known; return whether there is a subscription."""
+    def _open(self) -> None:
+        """Look for fields in the type, if it is known, and subscribe if there is one."""
         message_type = self.message_type
         if not message_type:
             found = self._node.get_publishers_info_by_topic(self.topic)
             message_type = min((end.topic_type for end in found), default='')
+        if not message_type:
+            return
         try:
-            if message_type:
-                self._take_type(message_type)
+            kind, types = message_class(message_type), definitions(message_type)
+            for listener in self.listeners:
+                listener.find(types, message_type)
+            self._served = [listener for listener in self.listeners if listener.field]
+            self._header = next((li.field.header for li in self._served), '')
+            if self._served:
+                self.message_type = message_type
+                self._subscription = endpoints.subscribe_with_info(
+                    self._node, kind, self.topic, self._on_message, copy(endpoints.SENSOR_QOS),
+                    qos_overriding_options=endpoints.OVERRIDABLE,
+                )  # fmt: skip
         except (LookupError, RuntimeError) as error:  # not installed here; rcl's
             for listener in self.listeners:
                 listener.error = f'{self.topic}: {error}'
-        return self._subscription is not None
 
-    def _take_type(self, message_type: str) -> None:
-        """Find the fields in a message type, and subscribe if there is one."""
-        kind, types = message_class(message_type), definitions(message_type)
-        for listener in self.listeners:
-            listener.find(types, message_type)
-        self._served = [listener for listener in self.listeners if listener.field]
-        self._header = next((li.field.header for li in self._served), '')
-        if self._subscription is None and self._served:
-            self.message_type = message_type
-            self._subscription = endpoints.subscribe_with_info(
-                self._node, kind, self.topic, self._on_message, copy(endpoints.SENSOR_QOS),
-                qos_overriding_options=endpoints.OVERRIDABLE,
-            )  # fmt: skip
-
-    def look(self) -> bool:
-        """
-        Look at the topic's publishers in the ROS graph; return whether it has begun to listen.
-
-        rclpy logs QoS that does not match.
-        """
+    def look(self) -> None:
+        """Look at the topic's publishers in the ROS graph; rclpy logs QoS that does not match."""
         if self._subscription is None:
-            return self._open()
+            self._open()
+            return
         self.delay, self._delay = self._delay, -math.inf
         self.heard, self.unheard = [], []
         for endpoint in self._node.get_publishers_info_by_topic(self.topic):
@@ -124,7 +117,6 @@ class Source:
                     f'expected {self.message_type}'
                 )
         self.numbers.single = len(self.heard) <= 1
-        return False
 
     def _on_message(self, message: Any, info: Mapping[str, Any]) -> None:
         published = info['source_timestamp']
@@ -143,21 +135,14 @@ class Source:
                 listener.why = str(error)
             else:
                 listener.take(stamps[listener.stamps], value)
-        self._sources.after_message()
+        self._after_message()
 
 
 class Sources:
-    """
-    The sources of a node, one for each topic.
+    """The sources of a node, one for each topic; `after_message` is called after each message."""
 
-    `on_type` is called when the type of a topic has become known, `after_message` after each
-    message.
-    """
-
-    def __init__(
-        self, node: Node, on_type: Callable[[], None], after_message: Callable[[], None]
-    ) -> None:
-        self._node, self._on_type, self.after_message = node, on_type, after_message
+    def __init__(self, node: Node, after_message: Callable[[], None]) -> None:
+        self._node, self._after_message = node, after_message
         self._by_topic: dict[str, Source] = {}
 
     def add(self, wanted: Input, take: Take) -> Listener:
@@ -167,7 +152,7 @@ class Sources:
         Raises ConfigurationError for a second type of a topic.
         """
         topic, kind = self._node.resolve_topic_name(wanted.topic), wanted.message_type
-        source = self._by_topic.setdefault(topic, Source(self._node, self, topic))
+        source = self._by_topic.setdefault(topic, Source(self._node, topic, self._after_message))
         if kind and source.message_type not in ('', kind):
             raise ConfigurationError(
                 f'topic {topic}: expected one message type for all inputs from it, got '
@@ -179,9 +164,8 @@ class Sources:
 
     def look(self) -> None:
         """Subscribe to the topics whose type has become known; look at publishers of others."""
-        begun = [source.look() for source in self._by_topic.values()]
-        if any(begun):
-            self._on_type()
+        for source in self._by_topic.values():
+            source.look()
 
 
 def find_wanted(types: Mapping[str, Any], wanted: Input, message_type: str) -> Field:
