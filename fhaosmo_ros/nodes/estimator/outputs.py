@@ -11,7 +11,6 @@ from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.parameters.declaration import Parameters
 from fhaosmo_ros.core.parameters.files import dumps
 from fhaosmo_ros.core.parameters.per_channel import differing
-from fhaosmo_ros.nodes.estimator.sources import Listener
 from fhaosmo_ros.nodes.middleware.endpoints import DEPTH, Listeners
 from fhaosmo_ros.nodes.middleware.messages import labelled, message_class, time_message
 from fhaosmo_ros.topics import STANDARD_DEVIATION, TYPED_ESTIMATES
@@ -102,20 +101,15 @@ def parameter_text(node: Node, values: Parameters, channels: Iterable[Any]) -> s
     """
     Return the parameters of a node as the text of a file that makes such a node.
 
-    It has the topics of y and u that a remapping has changed: a bag knows of none.
+    It has the full names of the topics of y and u: a bag knows of no remapping.
     """
-
-    def is_remapped(listener: Listener) -> bool:
-        return listener.source.topic != listener.wanted.absolute(node.get_namespace())
-
     named = differing(values)
     for channel in channels:
         prefix = f'{channel.name}.' if channel.name else ''
         y, u = channel.y, channel.u.values()
-        if is_remapped(y):
-            named[f'{prefix}input_topic'] = y.source.topic
-            named[f'{prefix}input_type'] = y.wanted.message_type
-        if any(map(is_remapped, u)):
+        named[f'{prefix}input_topic'] = y.source.topic
+        named[f'{prefix}input_type'] = y.wanted.message_type
+        if u:
             named[f'{prefix}known_input_topics'] = [one.source.topic for one in u]
             named[f'{prefix}known_input_types'] = [one.wanted.message_type for one in u]
     return dumps(named, node.get_fully_qualified_name())
