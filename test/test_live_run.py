@@ -178,19 +178,18 @@ def test_changes_of_one_channel_are_its_own(tmp_path, capsys):
     own = {'hip.epsilon': 3.0, 'knee.epsilon': 3.0, 'channels': ['hip', 'knee']}
     lives[0].tell_parameters(STAMPS[0], variant='fuzzy_adaptive', epsilon=7.0, **own)
     told = write(tmp_path / 'told', 1500, *lives)
-    (tmp_path / 'p.yaml').write_text(dumps(PARAMETERS))
+    (tmp_path / 'p.yaml').write_text(dumps(PARAMETERS | {'channels': ['hip', 'knee']}))
     for live in lives:
-        follow = ['--follow', live.name, '--params-file', tmp_path / 'p.yaml']
         channel = ['--channel', live.name.removeprefix('/estimator/')]
-        for arguments in ([bag, *follow], [told, *channel]):
-            text, found = run(capsys, *arguments)
+        for arguments in ([bag, '--params-file', tmp_path / 'p.yaml'], [told]):
+            text, found = run(capsys, *arguments, *channel)
             assert f'followed {live.name}' in text
             assert 'parameters differ' not in text
             expect(found, live)
     for arguments, said in (
         ([told, '--afresh', '--channel', 'hop'], '--channel: expected hip or knee, got hop'),
         ([bag], '(/estimator/hip, /estimator/knee)'),
-        ([bag, '--follow', '/middle'], "'/middle'"),
+        ([bag, '--node', '/middle'], 'expected --node and --channel'),
     ):
         assert said in run(capsys, *arguments, code=2)
 

@@ -127,7 +127,7 @@ def test_input_that_was_remapped_and_channels_are_recorded(launch, tmp_path):
         topics = {c.topic for c in reader.connections}
     assert '/rig/knee/y' not in topics  # nobody publishes it
     name = '/rig/estimator/hip'
-    chosen = ['-p', 'input_topic:=/force', '--follow', name, '--name', '/replay/hip']
+    chosen = ['-p', 'input_topic:=/force', '--channel', 'hip', '--name', '/replay/hip']
     result = run('replay', bag, '-o', tmp_path / 'out', *chosen)
     assert result.returncode == 0, result.stderr
     assert f'followed {name}' in result.stdout

@@ -64,15 +64,11 @@ def options() -> argparse.ArgumentParser:
         '(default: a bag BAG_replayed in the current folder)',
     )  # fmt: skip
     add('--force', action='store_true', help='replace an output that exists')
-    choice = parser.add_mutually_exclusive_group()
-    choice.add_argument(
-        '--follow', metavar='NAME',
-        help='live estimator whose first sample, resets and live changes to repeat (default: the '
-        'one whose ~/snapshot the bag holds)',
+    add(
+        '--afresh', action='store_true',
+        help='begin at the first sample; else begin, reset and change parameters where the live '
+        'estimator whose ~/snapshot the bag holds did',
     )  # fmt: skip
-    choice.add_argument(
-        '--afresh', action='store_true', help='begin at the first sample, follow no live estimator'
-    )
     add(
         '--smooth', action='store_true',
         help='estimate each time from the samples before and after it; needs noise_size (for '
@@ -88,11 +84,12 @@ def options() -> argparse.ArgumentParser:
     )
     add(
         '--node', default='estimator', metavar='NAME',
-        help='whose sections of the files to take, such as /rig/estimator (default: %(default)s)',
+        help='whose sections of the files to take, and which of several live estimators to '
+        'follow, such as /rig/estimator (default: %(default)s)',
     )  # fmt: skip
     add(
         '--channel', default='', metavar='NAME',
-        help="take the parameters of this one of the node's channels",
+        help="the same: of this one of the node's channels",
     )  # fmt: skip
     return parser
 
@@ -148,7 +145,7 @@ def _replay(arguments: argparse.Namespace, stop: Stop) -> None:
         reader = stack.enter_context(BagReader(path))
         followed = recorded = live = None
         if not arguments.afresh:
-            followed = find_estimator(reader, arguments.follow, arguments.channel)
+            followed = find_estimator(reader, arguments.node, arguments.channel)
         if not arguments.params_file:
             recorded = recorded_parameters(reader, followed)
         if recorded:

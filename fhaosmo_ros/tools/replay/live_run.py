@@ -30,26 +30,17 @@ class Event(NamedTuple):
     changes: dict[str, Any]
 
 
-def find_estimator(reader: BagReader, name: str | None, channel: str = '') -> str | None:
-    """
-    Return the name of the estimator to follow: the one given, or the only one with snapshots.
-
-    Where several channels have snapshots, `channel` chooses.
-    """
+def find_estimator(reader: BagReader, node: str, channel: str) -> str | None:
+    """Return the live estimator whose snapshots a bag has; of several that of node and channel."""
     found = reader.names_above(SNAPSHOT)
-    if name is not None and name not in found:
+    for part in (node.strip('/'), channel):
+        found = [name for name in found if f'/{part}/' in f'{name}/'] or found
+    if len(found) > 1:
         raise ConfigurationError(
-            f'--follow: expected an estimator whose snapshots are in the bag '
-            f'({", ".join(found) or "none"}), got {name!r}'
+            'expected --node and --channel of one of the live estimators in the bag '
+            f'({", ".join(found)}), or --afresh'
         )
-    of_channel = [other for other in found if channel and other.endswith(f'/{channel}')]
-    wanted = [name] if name else of_channel or found
-    if len(wanted) > 1:
-        raise ConfigurationError(
-            f'--follow: expected one of the live estimators in the bag ({", ".join(found)}), '
-            '--channel for one of a node, or --afresh'
-        )
-    return wanted[0] if wanted else None
+    return found[0] if found else None
 
 
 class LiveRun:
