@@ -69,7 +69,6 @@ class BagReader:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.unchecked = False  # True if data without a CRC was read: its damage goes unnoticed
         self.lacking: Counter[str] = Counter()  # messages that `samples` left out, by the reason
         with _readable(path), ExitStack() as stack:
             _expect_bag(path)
@@ -147,7 +146,6 @@ class BagReader:
     def _rows(self, storage: Any, chosen: Mapping[int, Connection]) -> Iterator[Row]:
         """Yield messages by log time, with the publish time of mcap, which rosbags leaves out."""
         if not isinstance(storage, McapReader):
-            self.unchecked = True
             for c, stamp, data in storage.messages(chosen.values()):
                 yield stamp, 0, c.id, data
             return
@@ -188,12 +186,10 @@ class BagReader:
                     yield logged, published, channel, data[begin + MESSAGE.size : at]
             elif opcode == Opcode.CHUNK:
                 chunk = Chunk.read(ReadDataStream(BytesIO(data[begin:at])))
-                self.unchecked |= not chunk.uncompressed_crc
                 stream, size = get_chunk_data_stream(chunk, validate_crc=True)
                 yield from self._messages(stream.read(size), 0, size, chosen)
             elif opcode == Opcode.DATA_END:
                 crc = int.from_bytes(data[begin:at], 'little')
-                self.unchecked |= not crc
                 if crc and crc32(memoryview(data)[: begin - RECORD.size]) != crc:
                     raise ValueError('the messages do not agree with their CRC')
 

@@ -207,8 +207,6 @@ def _replay(arguments: argparse.Namespace, stop: Stop) -> None:
     print(f'parameters: {origin}{changes}')
     if live:
         print(live.report())
-    if reader.unchecked:
-        print('the bag has no checksums: damage to its numbers would not be noticed')
     for final in finals:
         where = '' if final.suffix in TABLES else f' (estimates: {name}/...)'
         print(f'output: {final}{where}')
