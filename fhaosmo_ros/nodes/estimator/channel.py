@@ -15,7 +15,7 @@ from fhaosmo_ros.core.parameters.units import derivative_unit
 from fhaosmo_ros.inputs import known_inputs, measured_output
 from fhaosmo_ros.nodes.estimator.health import Health
 from fhaosmo_ros.nodes.estimator.outputs import estimate_messages
-from fhaosmo_ros.nodes.estimator.sources import check_input, Listener
+from fhaosmo_ros.nodes.estimator.sources import check_input, listen, Listener
 from fhaosmo_ros.nodes.middleware.diagnostics import array_of, OK, QUIET, Report, WARN
 from fhaosmo_ros.nodes.middleware.endpoints import create_publisher, full_name, LATCHED, Listeners
 from fhaosmo_ros.nodes.middleware.messages import labelled, message_class, time_message
@@ -66,8 +66,8 @@ class Channel:
         self._due = 0.0  # when the next snapshot is, by perf_counter
         self.u: dict[str, Listener] = {}
         for u, its in self.known.items():
-            self.u[u] = node.sources.add(its, partial(self._on_input, inputs.index(u)))
-        self.y = node.sources.add(self.measured, self._on_sample)  # after u
+            self.u[u] = listen(node, its, partial(self._on_input, inputs.index(u)))
+        self.y = listen(node, self.measured, self._on_sample)  # after u
         self.health = Health(self)
 
     def activate(self) -> None:

@@ -16,7 +16,7 @@ from fhaosmo_ros.inputs import with_joints
 from fhaosmo_ros.messages.fields import JOINT_STATE, listed
 from fhaosmo_ros.nodes.estimator.channel import Channel
 from fhaosmo_ros.nodes.estimator.outputs import parameter_text, TypedOutputs
-from fhaosmo_ros.nodes.estimator.sources import Sources
+from fhaosmo_ros.nodes.estimator.sources import Source
 from fhaosmo_ros.nodes.middleware import diagnostics
 from fhaosmo_ros.nodes.middleware.diagnostics import ERROR, OK, Report, STALE
 from fhaosmo_ros.nodes.middleware.endpoints import (
@@ -102,13 +102,13 @@ class EstimatorNode(ManagedNode):
                     throttle_duration_sec=diagnostics.QUIET,
                 )
 
-        names = self.create_subscription(
+        heard = self.create_subscription(
             JointState, topic, take, copy(SENSOR_QOS), qos_overriding_options=OVERRIDABLE
         )
         log.info(f'channels from_joint_names: waiting for the first message on {topic}')
         while not found:
             rclpy.spin_once(self, timeout_sec=0.1)  # so often a signal can end it
-        self.destroy_subscription(names)
+        self.destroy_subscription(heard)
         for name in set(own) - set(found):
             log.error(f"parameters of '{name}' are not used: there is no such joint")
         log.info(f'channels: {", ".join(found)}')
@@ -132,7 +132,7 @@ class EstimatorNode(ManagedNode):
         self._timer = self.create_timer(1.0 / values['publish_rate'], self._tick)
         self._timer.cancel()
         self.typed = TypedOutputs(self, values)
-        self.sources = Sources(self, self.typed.publish)
+        self.sources: dict[str, Source] = {}  # by topic
         for channel in channels:
             channel.open()
         by_prefix = {channel.prefix: [channel] for channel in channels}
@@ -148,7 +148,8 @@ class EstimatorNode(ManagedNode):
 
     def _look(self) -> None:
         """Look for y and u; in simulated time take dt from headers where all known y have one."""
-        self.sources.look()
+        for source in self.sources.values():
+            source.look()
         stamps = {channel.y.stamps for channel in self._channels if channel.y.stamps}
         if self._chooses_sampling and stamps == {'header'}:
             self._chooses_sampling = False

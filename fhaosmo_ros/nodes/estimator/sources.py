@@ -64,8 +64,8 @@ class Source:
     the latest header's stamp to its publication.
     """
 
-    def __init__(self, node: Node, topic: str, after_message: Callable[[], None]) -> None:
-        self._node, self.topic, self._after_message = node, topic, after_message
+    def __init__(self, node: Any, topic: str) -> None:
+        self._node, self.topic = node, topic
         self.message_type = ''
         self.heard: list[str] = []
         self.unheard: list[str] = []
@@ -135,37 +135,26 @@ class Source:
                 listener.why = str(error)
             else:
                 listener.take(stamps[listener.stamps], value)
-        self._after_message()
+        self._node.typed.publish()
 
 
-class Sources:
-    """The sources of a node, one for each topic; `after_message` is called after each message."""
+def listen(node: Any, wanted: Input, take: Take) -> Listener:
+    """
+    Return a listener to an input, at the one of the node's `sources` that is of its topic.
 
-    def __init__(self, node: Node, after_message: Callable[[], None]) -> None:
-        self._node, self._after_message = node, after_message
-        self._by_topic: dict[str, Source] = {}
-
-    def add(self, wanted: Input, take: Take) -> Listener:
-        """
-        Return a listener to an input; it hears a message after those that were added before.
-
-        Raises ConfigurationError for a second type of a topic.
-        """
-        topic, kind = self._node.resolve_topic_name(wanted.topic), wanted.message_type
-        source = self._by_topic.setdefault(topic, Source(self._node, topic, self._after_message))
-        if kind and source.message_type not in ('', kind):
-            raise ConfigurationError(
-                f'topic {topic}: expected one message type for all inputs from it, got '
-                f'{source.message_type} and {kind}'
-            )
-        source.message_type = source.message_type or kind
-        source.listeners.append(Listener(wanted, take, source))
-        return source.listeners[-1]
-
-    def look(self) -> None:
-        """Subscribe to the topics whose type has become known; look at publishers of others."""
-        for source in self._by_topic.values():
-            source.look()
+    It hears a message after those that were made before. Raises ConfigurationError for a second
+    type of a topic.
+    """
+    topic, kind = node.resolve_topic_name(wanted.topic), wanted.message_type
+    source = node.sources.setdefault(topic, Source(node, topic))
+    if kind and source.message_type not in ('', kind):
+        raise ConfigurationError(
+            f'topic {topic}: expected one message type for all inputs from it, got '
+            f'{source.message_type} and {kind}'
+        )
+    source.message_type = source.message_type or kind
+    source.listeners.append(Listener(wanted, take, source))
+    return source.listeners[-1]
 
 
 def find_wanted(types: Mapping[str, Any], wanted: Input, message_type: str) -> Field:
