@@ -231,6 +231,9 @@ def publish_samples(of: str, rate: float, joints: int, ended: threading.Event) -
     while not ended.is_set() and publisher.get_subscription_count() < SUBSCRIBERS:
         sleep(0.02)
     sleep(SETTLE)
+    if joints:  # an estimator makes channels of these names before the first sample
+        publisher.publish(message)
+        sleep(SETTLE)
     print('publishing', flush=True)
     count, start = 0, monotonic()
     while not ended.is_set():
