@@ -38,12 +38,6 @@ PARAMETERS = 'parameters'
 """Text of a parameter file (TEXT, transient-local), below the node's name."""
 TRUTH = {'state': ARRAY, 'unknown_input': FLOAT}
 """Topics of the plant below its name: the truth that belongs to each sample of y."""
-OF_ALL_NODES = {
-    '/diagnostics': DIAGNOSTICS,
-    '/rosout': 'rcl_interfaces/msg/Log',
-    '/parameter_events': 'rcl_interfaces/msg/ParameterEvent',
-}
-"""Topics that all nodes of a system share."""
 
 
 def estimates_of(parameters: Mapping[str, Any]) -> dict[str, str]:

@@ -13,7 +13,6 @@ from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.nodes.middleware.endpoints import SequenceNumbers, subscribe_with_info
 from fhaosmo_ros.nodes.middleware.messages import message_class
 from fhaosmo_ros.nodes.middleware.spin import of_rcl, Spinner
-from fhaosmo_ros.topics import OF_ALL_NODES
 import rclpy
 from rclpy.context import Context
 from rclpy.exceptions import ParameterException
@@ -32,9 +31,10 @@ OLD = 60 * 1_000_000_000
 Nanoseconds. A transient-local message that is older than the recording by more than this gets the
 stamp of the recording's beginning; else the bag would begin when somebody started the robot.
 """
+OF_ALL_NODES = ('/diagnostics', '/rosout', '/parameter_events')
 OF_NODES = ('/y', '/u', *OF_ALL_NODES)
 """Topics that are recorded with those of some nodes."""
-SHARED = ('/parameter_events', '/rosout', '/diagnostics', '/tf', '/tf_static')
+SHARED = (*OF_ALL_NODES, '/tf', '/tf_static')
 """Topics of many publishers: the sequence numbers of their messages say nothing."""
 
 
