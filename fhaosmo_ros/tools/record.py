@@ -55,13 +55,12 @@ def _record(arguments: argparse.Namespace, stop: Stop) -> None:
         arguments.all,
         arguments.ros_arguments,
     )
-    bar_format = '{desc}: {n_fmt} messages, {elapsed}'
     try:
         with bag, recorder:
             # Says when it listens, so that a user knows when to start what is to be recorded.
             print(f'recording to {path}; Ctrl-C ends it', flush=True)
             end = time.monotonic() + (arguments.duration or math.inf)
-            with progress(desc='record', unit='message', bar_format=bar_format) as bar:
+            with progress(desc='record', unit=' messages') as bar:
                 ended = False
                 while not ended:
                     ended = stop.wait(0.05) or time.monotonic() >= end
