@@ -220,7 +220,7 @@ def test_names_that_cannot_be_are_too_many_or_come_later_are_left_out(arm):
     many = {f'j{k}': 0.1 for k in range(500)}
     arm.send(**bad, **many)
     assert arm.answer(**many).name == list(many)[:64]
-    (line,) = arm.said('440 joints are no channels', 'more than 64')
+    (line,) = arm.said('440 joints are no channels', 'more than max_channels (64)')
     assert "'constants', '', 'left/wrist', 'j64', 'j65'" in line
     assert len(line) < 1000
     for k in range(300):

@@ -33,7 +33,6 @@ REMOVED = {
     'hardware_id': "leave it out: reports have 'none'",
     'warn_rate_below': 'leave it out: /diagnostics has the sample rate as a number',
     'warn_jitter_above': 'leave it out: WARN above 0.5',
-    'max_channels': "leave it out: from_joint_names takes 64; list more joints in 'channels'",
     'warn_delay_above': 'leave it out: WARN above 0.1 s',
 }
 """What a message says of a name that was a parameter once."""

@@ -217,8 +217,11 @@ CHANNEL_OUTPUT = (
 ESTIMATOR_NODE = (
     Parameter('channels', [''],
               'Names of the outputs that one process estimates from (docs/node.md, Many '
-              "channels). ['']: one, without prefix. from_joint_names: one for each joint, but at "
-              'most 64, of the first JointState on input_topic.', live=False, lengths='any'),
+              "channels). ['']: one, without prefix. from_joint_names: one for each joint of "
+              'the first JointState on input_topic.', live=False, lengths='any'),
+    Parameter('max_channels', 64,
+              'Most channels that from_joint_names makes; further joints are left out.', lower=1,
+              upper=10_000, live=False),
     Parameter('autostart', True,
               'Configure and activate at the start. false: wait for a lifecycle manager, or for '
               '`ros2 lifecycle set`.', live=False),

@@ -35,9 +35,6 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
-MOST_JOINTS = 64
-"""Channels that are made of the joints of a message, which may have thousands."""
-
 
 class EstimatorNode(ManagedNode):
     """
@@ -85,28 +82,32 @@ class EstimatorNode(ManagedNode):
     def _with_channels(self, values: Parameters) -> Parameters:
         if values[CHANNELS] != FROM_JOINTS:
             return values
-        if (kind := values['input_type']) != JOINT_STATE:
+        if (kind := values['input_type']) not in ('', JOINT_STATE):
             raise values.table['input_type'].error(kind, f'{JOINT_STATE} for {FROM_JOINTS[0]}')
         own, found = per_channel.channels_with_own(values), list[str]()
         self._new_channels(values, *own)  # bad parameters are told before any joint is known
-        topic, log = self.resolve_topic_name(values['input_topic']), self.get_logger()
+        topic, most = self.resolve_topic_name(values['input_topic']), values['max_channels']
+        log = self.get_logger()
 
         def take(message: JointState) -> None:
             names = dict.fromkeys(message.name)
-            found[:] = list(filter(self._fits, names))[:MOST_JOINTS]
+            found[:] = list(filter(self._fits, names))[:most]
             if left := [repr(name) for name in names if name not in found]:
                 log.warning(
                     f'{len(left)} joints are no channels, as topics can not have their names, or '
-                    f'there are more than {MOST_JOINTS}: {listed(left)}; name a channel, and set '
-                    'its input_field to position[NAME]',
+                    f'there are more than max_channels ({most}): {listed(left)}; raise it, or '
+                    'name a channel, and set its input_field to position[NAME]',
                     throttle_duration_sec=diagnostics.QUIET,
                 )
 
         heard = self.create_subscription(
             JointState, topic, take, copy(SENSOR_QOS), qos_overriding_options=OVERRIDABLE
         )
-        log.info(f'channels from_joint_names: waiting for the first message on {topic}')
         while not found:
+            log.warning(
+                f'channels from_joint_names: waiting for the first message on {topic}',
+                throttle_duration_sec=diagnostics.QUIET,
+            )
             rclpy.spin_once(self, timeout_sec=0.1)  # so often a signal can end it
         self.destroy_subscription(heard)
         for name in set(own) - set(found):
