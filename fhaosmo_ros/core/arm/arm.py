@@ -4,8 +4,7 @@
 from collections import Counter, deque
 from collections.abc import Mapping
 from pathlib import Path
-from threading import RLock
-from typing import Any, NamedTuple, NoReturn
+from typing import Any, NamedTuple
 
 from fhaosmo_ros.core.arm.bank import Bank
 from fhaosmo_ros.core.arm.doubts import Doubts
@@ -108,7 +107,7 @@ class Arm:
         self.joints, n = model.joints, len(model.joints)
         if calibration is None and p['calibration_file']:
             calibration = Calibration.loads(text_of(p, 'calibration_file', 'a YAML file'))
-        self._calibrated, self._alone = calibration is not None, RLock()  # a second thread waits
+        self._calibrated = calibration is not None
         known = self.calibration = calibration or Calibration.of_urdf(model)
         if known.joints != model.joints:
             own, got = ', '.join(model.joints), ', '.join(known.joints)
@@ -124,12 +123,10 @@ class Arm:
         scale = model.torque_of_weight()
         scale = np.maximum(scale, LEAST * np.max(scale))
         self._model_variance = self._size('model_error', MODEL_ERROR * scale) ** 2
-        told, speed = self._size('torque_noise'), self._values('velocity_noise')
-        # Of efforts, positions and velocities: at first, at least and at most.
-        first = np.array([TORQUE_NOISE * scale, self._size('position_noise'), speed])
-        noise = np.array([first, first, np.full_like(first, np.inf)])
-        noise[1, 0] *= LEAST_FOUND
-        noise[:, 0] = np.where(told > 0.0, told, noise[:, 0])
+        # Of efforts, positions and velocities: at first, and at least.
+        told = np.where(known.torque_noise > 0.0, known.torque_noise, TORQUE_NOISE * scale)
+        noise = np.array([told, self._size('position_noise'), self._values('velocity_noise')])
+        least = noise * [[LEAST_FOUND], [1.0], [1.0]]
         strong = np.fmax(np.where(model.effort_limits < np.inf, model.effort_limits, 0.0), scale)
         fastest = FASTER * model.velocity_limits
         limits = np.array([
@@ -137,7 +134,7 @@ class Arm:
             [STRONGER * strong, model.highest + FURTHER, fastest],
         ])  # fmt: skip
         self._samples = Samples(
-            noise, limits, constants, STOPPING * strong, model.continuous, self._of_position
+            noise, least, limits, constants, STOPPING * strong, model.continuous, self._of_position
         )
         self._bank = Bank(
             2.0 * DECAY * self._model_variance, DECAY, np.array(INTENSITIES) * model.weight, RATES,
@@ -147,9 +144,6 @@ class Arm:
         self.counters: Counter[str] = Counter()
         self.problem = ''
         self.reset()
-
-    def __reduce__(self) -> NoReturn:
-        raise TypeError('an Arm can not be copied or pickled: make another one')
 
     def _values(self, name: str) -> Floats:
         """Return a parameter that has one value, or one for each joint."""
@@ -165,15 +159,14 @@ class Arm:
 
     def reset(self) -> None:
         """Begin anew with the next sample."""
-        with self._alone:
-            self._samples.reset()
-            self._forget()
+        self._samples.reset()
+        self._forget()
 
     def _forget(self) -> None:
-        # Times, positions, and how far the joints have moved beside velocities: what waits for its
-        # effort. Then time and way of the latest effort.
-        self._kept: deque[tuple[float, Floats, Floats]] = deque()
-        self._then = np.nan, self._rest
+        # Samples that wait for their torque: time (s), stamp, `h`, `vague` and `latest`. Then the
+        # time of the latest sample and its torque.
+        self._waiting: deque[tuple[float, int, float, float, Floats]] = deque()
+        self._time, self._torque = 0.0, self._rest
         self._velocity: Floats | None = None  # estimated
         self._contact = False
         self._looked, self._evidence = 0, self._rest  # stamp, and log-likelihood of each link
@@ -182,18 +175,16 @@ class Arm:
 
     def adopt(self, parameters: Parameters) -> None:
         """Go on with other live parameters; raise ConfigurationError for a bad payload."""
-        with self._alone:
-            self.model.set_payload(payload_of(parameters))
+        self.model.set_payload(payload_of(parameters))
         self.parameters = ARM_PARAMETERS.complete(parameters)
         rare = np.log(parameters['false_alarms_per_minute'])
         self._threshold = (self.calibration.log_odds or ODDS) - rare
 
     def tare(self) -> None:
         """Take the present external torque for zero from now on."""
-        with self._alone:
-            now = self._bank.mean[2].copy()
-            self._tare -= now
-            self._bank.shift(now)
+        now = self._bank.mean[2].copy()
+        self._tare -= now
+        self._bank.shift(now)
 
     def take(
         self, stamp: int, q: ArrayLike, effort: ArrayLike, velocity: ArrayLike | None = None
@@ -216,46 +207,37 @@ class Arm:
             None where there is none yet, or the sample was not used; `problem` says why.
 
         """
-        with self._alone:
-            samples, found = self._samples, None
-            speed = self._rest if self._of_position else velocity
-            problem = samples.take(stamp, effort, q, speed, self._velocity, self._bank.motion)
-            self.problem = '' if problem == 'first' else problem
-            if not problem:
-                go_on = self._go_on_late if self._delay else self._go_on
-                place = samples.position.copy()  # the next sample is written over it
-                found = go_on(stamp, place, samples.h, samples.way, samples.velocity)
-            if self.problem in ANEW:
-                self._forget()
-            if self.problem or found is not None:
-                self.counters[self.problem or 'used'] += 1
-            return found
+        samples, found = self._samples, None
+        speed = self._rest if self._of_position else velocity
+        problem = samples.take(stamp, effort, q, speed, self._velocity, self._bank.mean[1])
+        self.problem = '' if problem == 'first' else problem
+        if not problem:
+            found = self._go_on_to_torque(stamp)
+        if self.problem in ANEW:
+            self._forget()
+        if self.problem or found is not None:
+            self.counters[self.problem or 'used'] += 1
+        return found
 
-    def _go_on_late(
-        self, stamp: int, q: Floats, h: float, way: Floats, velocity: Floats
-    ) -> ArmEstimate | None:
-        """Go on to the time when the effort was measured, between two samples before."""
-        kept = self._kept
-        time, _, (before, _) = kept[-1] if kept else (0.0, q, (0.0, velocity))
-        kept.append((time + h, q, np.array([before + way, velocity])))
-        then = kept[-1][0] - self._delay
-        while len(kept) > 2 and kept[1][0] <= then:
-            kept.popleft()
-        if len(kept) < 2 or kept[0][0] > then:
-            return None
-        (t0, _, first), (t1, q, second) = kept[0], kept[1]
-        back = (t1 - then) / (t1 - t0) * (second - first)
-        way, velocity = second - back
-        h, moved = then - self._then[0], way - self._then[1]
-        self._then = then, way
-        if np.isnan(h):
-            return None
-        return self._go_on(stamp - round(1e9 * self._delay), q - back[0], h, moved, velocity)
+    def _go_on_to_torque(self, stamp: int) -> ArmEstimate | None:
+        """Go on to samples whose torque is known now: the latest one's is `torque_delay` old."""
+        samples, found = self._samples, None
+        latest = samples.latest.copy()  # the next sample is written over it
+        self._time += samples.h
+        self._waiting.append((self._time, stamp, samples.h, samples.vague, latest))
+        known = self._time - self._delay
+        while self._waiting and self._waiting[0][0] <= known and not self.problem:
+            time, stamp, h, vague, sample = self._waiting.popleft()
+            torque = latest[0] + (known - time) / samples.h * (self._torque - latest[0])
+            found = self._go_on(torque, stamp, h, vague, sample)
+        self._torque = latest[0]
+        return found
 
     def _go_on(
-        self, stamp: int, q: Floats, h: float, way: Floats, velocity: Floats
+        self, torque: Floats, stamp: int, h: float, vague: float, sample: Floats
     ) -> ArmEstimate | None:
-        """Go on to a sample at q, `h` seconds after the one before; `velocity` is measured."""
+        """Go on to a sample, `h` seconds after the one before; see `Samples`."""
+        _, q, velocity, way = sample
         bank, samples, before = self._bank, self._samples, self._velocity
         if before is None or not self._of_position:
             known = self._sliding = way / h if self._of_position else velocity
@@ -269,21 +251,20 @@ class Arm:
                 self._sliding = ahead + (1.0 - keep**2) * news
                 self._faster = self._faster + (1.0 - keep) ** 2 / h * news
         mass, coriolis, gravity = self.model.terms(q, known)
-        less = [self._tare]
+        drive = torque + known @ coriolis - self._tare
         if self._with_gravity:
-            less.append(gravity)
+            drive -= gravity
         if self._calibrated:
             # Of encoders alone, because the estimate M^-1 p would feed its own error of friction
             # back, worst at joints of little inertia. What they say is of half a sample ago.
-            less.append(self.calibration.friction(self._sliding + 0.5 * h * self._faster))
-        drive = bank.net_torque(samples.torque, known, coriolis, less)
+            drive -= self.calibration.friction(self._sliding + 0.5 * h * self._faster)
         if before is None:
             wide = samples.variance[1] / (h * h) if self._of_position else samples.variance[2]
             spread = (mass * (2.0 * wide)) @ mass.T
             bank.start(mass, drive, mass @ known, spread, self._model_variance)
         change = way if self._of_position else velocity
-        bank.step(h, mass, change, samples.vague, drive, self._reach)
-        self.doubts.take(h, q, samples.torque, bank.mean[2])
+        bank.step(h, mass, change, vague, drive, self._reach)
+        self.doubts.take(h, q, torque, bank.mean[2])
         if self.doubts.text and not self.doubts.payload:
             self.problem = 'doubted'
             return None

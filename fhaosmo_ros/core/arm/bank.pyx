@@ -48,7 +48,6 @@ cdef class Bank:
     cdef readonly int joints, filters
     cdef readonly bint of_position
     cdef readonly double log_odds  # of contact against free motion
-    cdef readonly object motion  # (n,): M times `change` of the latest step
     cdef readonly object mean  # (3, n): Y less what was measured, p and d
     cdef readonly object covariance  # (n, n) of d, if the likeliest filter is right
     cdef readonly object weights  # (m + 1,), the first of free motion
@@ -67,8 +66,6 @@ cdef class Bank:
     # M and u at the sample before, and between it and the next one.
     cdef double[:, ::1] mass, middle
     cdef double[::1] drive, mean_drive
-    cdef readonly object u  # (n,), as `net_torque` has summed it up
-    cdef double[::1] net
 
     def __cinit__(
         self, free_intensity, double decay, scales, rates, variance, double onset=0.0,
@@ -85,14 +82,12 @@ cdef class Bank:
         self.onset, self.since = onset, fmax(since, 1e-15)
         self.s = np.zeros((m + 1, 3 * n + 1, 3 * n))
         self.work = np.zeros((n, 4 * n + 1))
-        self.motion, self.mean, self.covariance = np.zeros(n), np.zeros((3, n)), np.zeros((n, n))
-        self.measured, self.spread, self.noise = self.motion, self.covariance, np.zeros((n, n))
-        self.average = self.mean.reshape(-1)
+        self.mean, self.covariance = np.zeros((3, n)), np.zeros((n, n))
+        self.average, self.spread = self.mean.reshape(-1), self.covariance
         self.weights, self.mixed, self.anew, self.likelihood = np.zeros((4, m))
         self.w = self.weights
-        self.mass, self.middle = np.zeros((2, n, n))
-        self.u = np.zeros(n)
-        self.net, (self.drive, self.mean_drive) = self.u, np.zeros((2, n))
+        self.mass, self.middle, self.noise = np.zeros((3, n, n))
+        self.drive, self.mean_drive, self.measured = np.zeros((3, n))
         self.start(0.0, 0.0, np.zeros(n), np.zeros((n, n)), np.zeros(n))
 
     def start(self, mass, drive, momentum, momentum_covariance, torque_variance):
@@ -120,28 +115,6 @@ cdef class Bank:
         np.asarray(self.s)[:, 0, 2 * self.joints :] -= torque
         self.mean[2] -= torque
 
-    def net_torque(
-        self, const double[::1] torque, const double[::1] velocity,
-        const double[:, :] coriolis, less,
-    ):
-        """
-        Return u = torque + C^T qd - all that is in `less`: gravity, say, and friction.
-
-        The array is written anew by the next call.
-        """
-        cdef int i, k, n = self.joints
-        cdef const double[::1] known
-        if not n == torque.shape[0] == velocity.shape[0] == coriolis.shape[0] == coriolis.shape[1]:
-            raise ValueError(f'expected arrays of {n} joints')
-        for i in range(n):
-            self.net[i] = torque[i]
-            for k in range(n):
-                self.net[i] += coriolis[k, i] * velocity[k]
-        for known in less:
-            for i in range(n):
-                self.net[i] -= known[i]
-        return self.u
-
     def step(
         self, double h, const double[:, :] mass, const double[::1] change, double vague,
         const double[::1] drive, const double[:, ::1] shape,
@@ -166,7 +139,6 @@ cdef class Bank:
 
         """
         cdef int i, j, k, n = self.joints
-        cdef double moved
         cdef const double[::1] variance = self.variance[1 if self.of_position else 2]
         if not (
             n == mass.shape[0] == mass.shape[1] == change.shape[0] == drive.shape[0]
@@ -176,26 +148,23 @@ cdef class Bank:
         for i in range(n):
             self.mean_drive[i] = 0.5 * (self.drive[i] + drive[i])
             self.drive[i] = drive[i]
-            moved = 0.0
+            self.measured[i] = 0.0
             for k in range(n):
                 # Y has changed by the mean M, while p is by that of now.
                 self.middle[i, k] = mass[i, k]
                 if self.of_position:
                     self.middle[i, k] = 0.5 * (self.mass[i, k] + mass[i, k])
                 self.mass[i, k] = mass[i, k]
-                moved += self.middle[i, k] * change[k]
-            self.measured[i] = moved
+                self.measured[i] += self.middle[i, k] * change[k]
         for i in range(n):  # M S M' + (vague M v)(vague M v)'
             for j in range(n):
-                moved = vague * self.measured[i] * vague * self.measured[j]
+                self.noise[i, j] = vague * self.measured[i] * vague * self.measured[j]
                 for k in range(n):
-                    moved += self.middle[i, k] * variance[k] * self.middle[j, k]
-                self.noise[i, j] = moved
-        with nogil:
-            self.mix(h)
-            self.predict(h, shape)
-            self.correct()
-            self.weigh()
+                    self.noise[i, j] += self.middle[i, k] * variance[k] * self.middle[j, k]
+        self.mix(h)
+        self.predict(h, shape)
+        self.correct()
+        self.weigh()
 
     cdef VECTORISED mix(self, double h) noexcept nogil:
         """
@@ -204,40 +173,34 @@ cdef class Bank:
         Where contact ends, the torque ends: d begins anew, with what the model does not explain.
         """
         cdef Py_ssize_t j, k, n = self.joints, size = 3 * n, contacts = self.filters - 1
-        cdef double begin = -expm1(-self.begin * h) / contacts, end = -expm1(-self.end * h)
-        cdef double other = 0.0  # probability that contact goes on with one other intensity
-        cdef double touched = 1.0 - self.w[0], stay, share
+        cdef double begun = -expm1(-self.begin * h) * self.w[0], end = -expm1(-self.end * h)
+        cdef double touched = 1.0 - self.w[0], other = 0.0, stay, share
         cdef double* free = &self.s[0, 0, 0]
         cdef double* contact = &self.s[contacts + 1, 0, 0]
-        cdef double* filter
-        if contacts > 1:
+        if contacts > 1:  # probability that contact goes on with one other intensity
             other = (1.0 - end) * -expm1(-self.change * h) / (contacts - 1)
         stay = 1.0 - end - contacts * other  # by how much likelier the same one is
         self.s[contacts + 1, :, :] = 0.0
         for j in range(contacts + 1):
             # Means become those off that of all, and covariances squares, which can be added.
-            filter = &self.s[j, 0, 0]
-            add(filter, -1.0, &self.average[0], 2 * n)
-            add_square(filter, 1.0, size)
+            add(&self.s[j, 0, 0], -1.0, &self.average[0], 2 * n)
+            add_square(&self.s[j, 0, 0], 1.0, size)
             if j > 0:
-                add(contact, self.w[j], filter, size * (size + 1))
+                add(contact, self.w[j], &self.s[j, 0, 0], size * (size + 1))
         for j in range(1, contacts + 1):
-            self.mixed[j] = begin * self.w[0] + other * touched + stay * self.w[j]
+            self.mixed[j] = begun / contacts + other * touched + stay * self.w[j]
             share = 1.0 / self.mixed[j]
-            self.anew[j] = begin * self.w[0] * share
-            filter = &self.s[j, 0, 0]
-            scale(filter, stay * self.w[j] * share, size * (size + 1))
-            add(filter, other * share, contact, size * (size + 1))
-            add(filter, self.anew[j], free, size * (size + 1))
+            self.anew[j] = begun / contacts * share
+            scale(&self.s[j, 0, 0], stay * self.w[j] * share, size * (size + 1))
+            add(&self.s[j, 0, 0], other * share, contact, size * (size + 1))
+            add(&self.s[j, 0, 0], self.anew[j], free, size * (size + 1))
         self.s[contacts + 1, :, 2 * n :] = 0.0
         self.s[contacts + 1, 2 * n + 1 :, :] = 0.0
         for k in range(n):
-            self.s[contacts + 1, 1 + 2 * n + k, 2 * n + k] = (
-                touched * self.free[k] / (2.0 * self.decay)
-            )
-        stay = (1.0 - contacts * begin) * self.w[0]
-        self.mixed[0] = stay + end * touched
-        scale(free, stay / self.mixed[0], size * (size + 1))
+            share = touched * self.free[k] / (2.0 * self.decay)
+            self.s[contacts + 1, 1 + 2 * n + k, 2 * n + k] = share
+        self.mixed[0] = self.w[0] - begun + end * touched
+        scale(free, (self.w[0] - begun) / self.mixed[0], size * (size + 1))
         add(free, end / self.mixed[0], contact, size * (size + 1))
         for j in range(contacts + 1):
             add_square(&self.s[j, 0, 0], -1.0, size)
@@ -250,34 +213,28 @@ cdef class Bank:
         Where contact has begun, d may have jumped, now or a little earlier.
         """
         cdef Py_ssize_t j, i, a, b, n = self.joints
-        cdef double rate, stay, to_p, to_y, jump, own
+        cdef double stay, jump, own, contact
         cdef double[3] push  # what a torque within h does to Y, p and d
-        cdef double[9] free, contact  # of Y, p and d: how much of `free` and of `shape`
+        cdef double[9] now, earlier  # what white noise of d' within h, and before, does to them
         cdef double* row
         push[:] = [0.5 * h * h, h, 0.0]
-        free[:] = [0.0] * 9
-        grow(free, h, 1.0)
+        grow(now, h)
+        grow(earlier, self.since)
+        carry(earlier, 1, h, 1.0)
         for j in range(self.filters):
-            rate = 0.0 if j else self.decay
-            stay = exp(-rate * h)
-            to_p = -expm1(-rate * h) / rate if rate > 0.0 else h
-            # The difference is of two nearly equal numbers where the decay is slow.
-            to_y = (h - to_p) / rate if rate * h > 1e-4 else h * h * (0.5 - rate * h / 6.0)
-            advance(&self.s[j, 0, 0], n, h, to_y, to_p, stay)
-            carry(&self.s[j, 1, 0], n, h, to_y, to_p, stay)
-            contact[:] = [0.0] * 9
-            jump = self.scales[j] * self.anew[j] * self.onset
-            grow(contact, self.since, jump / self.since)
-            carry(contact, 1, h, to_y, to_p, stay)
-            grow(contact, h, self.scales[j])
+            stay = 1.0 if j else exp(-self.decay * h)
+            jump = self.anew[j] * self.onset / self.since
+            advance(&self.s[j, 0, 0], n, h, stay)
+            carry(&self.s[j, 1, 0], n, h, stay)
             for a in range(3):
                 for i in range(n):
                     self.s[j, 0, a * n + i] += push[a] * self.mean_drive[i]
                     for b in range(3):
                         row = &self.s[j, 1 + a * n + i, b * n]
                         own = push[a] * push[b] * self.variance[0, i]
-                        row[i] += own + free[3 * a + b] * self.free[i]
-                        add(row, contact[3 * a + b], &shape[i, 0], n)
+                        row[i] += own + now[3 * a + b] * self.free[i]
+                        contact = self.scales[j] * (now[3 * a + b] + jump * earlier[3 * a + b])
+                        add(row, contact, &shape[i, 0], n)
 
     cdef VECTORISED correct(self) noexcept nogil:
         """Correct all filters by the sample, and write how likely it was to each."""
@@ -309,12 +266,9 @@ cdef class Bank:
                     add(&p[i, 0], -work[o, n + i], &work[o, n], i + 1)
                 for k in range(i):  # an asymmetry of rounding would grow with time
                     p[k, i] = p[i, k]
-            # Y begins anew at each sample, of positions with what it is more than measured.
-            for i in range(n):
-                self.s[j, 0, i] = self.s[j, 0, i] - self.measured[i] if self.of_position else 0.0
-            if not self.of_position:
-                p[:n, :] = 0.0
-                p[:, :n] = 0.0
+            # Y begins anew at each sample, with what it is more than measured.
+            if self.of_position:
+                add(&self.s[j, 0, 0], -1.0, &self.measured[0], n)
 
     cdef VECTORISED weigh(self) noexcept nogil:
         """
@@ -370,37 +324,28 @@ cdef inline void add_square(double* x, double share, Py_ssize_t size) noexcept n
 
 
 cdef inline void advance(
-    double* y, Py_ssize_t count, double h, double to_y, double to_p, double stay
+    double* y, Py_ssize_t count, double h, double stay
 ) noexcept nogil:
     """Multiply by the transition: so many numbers that belong to Y, then to p and to d."""
     cdef double* p = y + count
     cdef double* d = p + count
     cdef Py_ssize_t k
     for k in range(count):
-        y[k] += h * p[k] + to_y * d[k]
-        p[k] += to_p * d[k]
+        y[k] += h * p[k] + 0.5 * h * h * d[k]
+        p[k] += h * d[k]
         d[k] *= stay
 
 
-cdef inline void carry(
-    double* p, Py_ssize_t n, double h, double to_y, double to_p, double stay
-) noexcept nogil:
+cdef inline void carry(double* p, Py_ssize_t n, double h, double stay) noexcept nogil:
     """Multiply a covariance of n joints by the transition from both sides."""
     cdef Py_ssize_t i
-    advance(p, 3 * n * n, h, to_y, to_p, stay)
+    advance(p, 3 * n * n, h, stay)
     for i in range(3 * n):
-        advance(p + i * 3 * n, n, h, to_y, to_p, stay)
+        advance(p + i * 3 * n, n, h, stay)
 
 
-cdef void grow(double* p, double t, double intensity) noexcept nogil:
-    """Add the covariance of Y, p and d that white noise of d' makes within t seconds."""
-    cdef double to_d = intensity * t, t2 = t * t
-    p[8] += to_d
-    p[7] += to_d * t / 2.0
-    p[5] += to_d * t / 2.0
-    p[4] += to_d * t2 / 3.0
-    p[6] += to_d * t2 / 6.0
-    p[2] += to_d * t2 / 6.0
-    p[3] += to_d * t2 * t / 8.0
-    p[1] += to_d * t2 * t / 8.0
-    p[0] += to_d * t2 * t2 / 20.0
+cdef void grow(double* p, double t) noexcept nogil:
+    """Write the covariance of Y, p and d that white noise of d' makes within t seconds."""
+    p[0], p[1], p[2] = t**5 / 20.0, t**4 / 8.0, t**3 / 6.0
+    p[3], p[4], p[5] = p[1], t**3 / 3.0, t**2 / 2.0
+    p[6], p[7], p[8] = p[2], p[5], t

@@ -83,7 +83,7 @@ class Doubts:
             if cosine < -0.9:
                 return 'the efforts of all joints have the wrong sign'
             if cosine < 0.98 and 0.7 < size < 1.4:
-                text = ', '.join(f'{x:.2f}' for x in gravity)
+                text = ', '.join(f'{x:.1f}' for x in gravity)
                 return f"gravity is as if it were [{text}] in the base's frame: parameter gravity"
         slopes = both / np.maximum(own, 1e-12)
         reverses = (np.abs(slopes + 2.0) < 0.5) & (squares > LARGE**2 * count)

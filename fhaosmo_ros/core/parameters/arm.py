@@ -34,9 +34,6 @@ ARM = (
     Parameter('velocity_noise', [1e-3],
               'Standard deviation of the noise of a velocity, at least; more is found.',
               unit='rad/s', lower=1e-9, upper=100.0, live=False, lengths='1 or n'),
-    Parameter('torque_noise', [0.0],
-              'Standard deviation of the noise of a torque from sample to sample; 0: it is found.',
-              unit='N m', lower=0.0, upper=1e6, live=False, lengths='1 or n'),
     Parameter('model_error', [0.0],
               'Standard deviation of the torque that the model does not explain in free motion, '
               "such as friction; 0 for 1.5 % of the torque of the arm's own weight.", unit='N m',
