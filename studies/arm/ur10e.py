@@ -6,11 +6,12 @@ The folder has the files on that robot of shamilmamedov/dynamic_calibration (Git
 """
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 import re
 
-from fhaosmo_ros.core.arm.identification import identify, unexplained
-from fhaosmo_ros.core.arm.model import ArmModel
+from fhaosmo_ros.core.arm.identification import identify, payload_of_motion
+from fhaosmo_ros.core.arm.model import ArmModel, Calibration
 from fhaosmo_ros.stop_signals import Stop
 from fhaosmo_ros.tools.cli.command import run_command
 import numpy as np
@@ -32,7 +33,8 @@ def main() -> int:
         days = [_recording(next(arguments.folder.rglob(name))) for name in FREE]
         for name, day, (t, q, current) in zip(FREE, days, days[::-1], strict=True):
             found = identify(model, *day, torque_constants=constants).calibration
-            left = unexplained(model, t, q, current, found)
+            alone = replace(Calibration.of_urdf(model), torque_constants=constants)
+            left = [payload_of_motion(model, t, q, current, c)[1] for c in (alone, found)]
             rows = [
                 [joint, f'{urdf:.3g}', f'{after:.3g}', f'{after / urdf:.2f}']
                 for joint, urdf, after in zip(model.joints, *left, strict=True)

@@ -106,17 +106,6 @@ def identify(
     )  # fmt: skip
 
 
-def unexplained(
-    model: ArmModel, t: Floats, q: Floats, effort: Floats, calibration: Calibration
-) -> tuple[Floats, Floats]:
-    """Return the RMS of the torque that the URDF leaves, `model`, and a calibration, (n,) each."""
-    alone, calibrated = (
-        _Regression(model, t, q, effort, known, calibration.torque_constants).unexplained
-        for known in (Calibration.of_urdf(model), calibration)
-    )
-    return _rms(alone), _rms(calibrated)
-
-
 def payload_of_motion(
     model: ArmModel, t: Floats, q: Floats, effort: Floats, calibration: Calibration
 ) -> tuple[Floats, Floats, Floats]:

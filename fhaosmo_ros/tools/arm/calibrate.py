@@ -9,7 +9,7 @@ from typing import Any
 
 from fhaosmo_ros.core.arm import identification
 from fhaosmo_ros.core.arm.arm import Arm
-from fhaosmo_ros.core.arm.model import Calibration, Floats
+from fhaosmo_ros.core.arm.model import Floats
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.stop_signals import Stop
 from fhaosmo_ros.tools.arm.replay import add_options, arm_parameters, description, joint_samples
@@ -29,14 +29,9 @@ def main(argv: list[str] | None = None) -> int:
         'states in which nothing touches it, and write them to a file for the node arm.',
     )
     parser.add_argument('--bag', type=Path, required=True, help='a minute of free motion')
-    known = parser.add_mutually_exclusive_group()
-    known.add_argument(
+    parser.add_argument(
         '--payload', action='store_true',
-        help='find the payload only; everything else is that of calibration_file',
-    )  # fmt: skip
-    known.add_argument(
-        '--check', action='store_true',
-        help='find nothing; say how well calibration_file explains this bag, of another day say',
+        help='find the payload only, and how much of the torque calibration_file explains',
     )  # fmt: skip
     add_options(parser, 'calibration.yaml', 'file to write, with a figure beside it')
     return run_command(parser, argv, _calibrate)
@@ -44,17 +39,14 @@ def main(argv: list[str] | None = None) -> int:
 
 def _calibrate(arguments: argparse.Namespace, stop: Stop) -> None:
     values = arm_parameters(arguments)
-    if (arguments.payload or arguments.check) and not values.get('calibration_file'):
+    if arguments.payload and not values.get('calibration_file'):
         raise ConfigurationError(
-            '--payload, --check: expected -p calibration_file:=FILE of the arm without payload, '
-            'got none'
+            '--payload: expected -p calibration_file:=FILE of the arm without payload, got none'
         )
     with stop.raising(), BagReader(arguments.bag) as reader:
         urdf = description(reader, arguments)
-        unknown: dict[str, Any] = {'calibration_file': ''}
-        if arguments.payload or arguments.check:
-            unknown = {'payload': [0.0] * 4} if arguments.payload else {}
-        arm = Arm(urdf, values | unknown)
+        found_anew = {'payload': [0.0] * 4} if arguments.payload else {'calibration_file': ''}
+        arm = Arm(urdf, values | found_anew)
         stamps, rows = zip(*joint_samples(reader, arguments.topic, arm), strict=True)
         when, samples = np.array(stamps), np.array(rows)
         newest = np.maximum.accumulate(np.concatenate([[0], when[:-1]]))
@@ -64,11 +56,6 @@ def _calibrate(arguments: argparse.Namespace, stop: Stop) -> None:
         torque = effort
         if arm.parameters['effort'] == 'gravity_compensated':
             torque = effort + np.array([arm.model.terms(row, 0.0 * row).gravity for row in q])
-        if arguments.check:
-            alone = Arm(urdf, values | {'calibration_file': ''}).model  # with gravity and payload
-            left = identification.unexplained(alone, t, q, torque, arm.calibration)
-            print(_table(arm.joints, 'URDF', 'calibrated', *left))
-            return
         if arguments.payload:
             payload, *left = identification.payload_of_motion(
                 arm.model, t, q, torque, arm.calibration
@@ -83,10 +70,8 @@ def _calibrate(arguments: argparse.Namespace, stop: Stop) -> None:
             constants = np.where(given == 1.0, 0.0, given)
         found = identification.identify(arm.model, t, q, torque, torque_constants=constants)
         # What the node says of this motion without calibration, of a wrong sign say.
-        urdf_alone = replace(
-            Calibration.of_urdf(arm.model), torque_constants=found.calibration.torque_constants
-        )
-        alone = Arm(urdf, values, calibration=urdf_alone)
+        given = {'torque_constants': found.calibration.torque_constants}
+        alone = Arm(urdf, values | found_anew | given)
         alone.run(t, q, effort, *velocity)
         # The log-odds of contact that this free motion reaches once a minute.
         free = Arm(urdf, values, calibration=found.calibration)
