@@ -122,10 +122,12 @@ class Arm:
         constants = np.where(given == 1.0, known.torque_constants, given)
         scale = model.torque_of_weight()
         scale = np.maximum(scale, LEAST * np.max(scale))
-        self._model_variance = self._size('model_error', MODEL_ERROR * scale) ** 2
+        usual = [TORQUE_NOISE * scale, self._values('position_noise'), MODEL_ERROR * scale]
+        found = np.array([known.torque_noise, known.position_noise, known.model_error])
+        of_torque, of_position, error = np.where(found > 0.0, found, usual)
+        self._model_variance = error**2
         # Of efforts, positions and velocities: at first, and at least.
-        told = np.where(known.torque_noise > 0.0, known.torque_noise, TORQUE_NOISE * scale)
-        noise = np.array([told, self._size('position_noise'), self._values('velocity_noise')])
+        noise = np.array([of_torque, of_position, self._values('velocity_noise')])
         least = noise * [[LEAST_FOUND], [1.0], [1.0]]
         strong = np.fmax(np.where(model.effort_limits < np.inf, model.effort_limits, 0.0), scale)
         fastest = FASTER * model.velocity_limits
@@ -151,11 +153,6 @@ class Arm:
         if len(given) not in (1, n):
             raise ARM_PARAMETERS[name].error(given, f'1 or {n} numbers')
         return np.broadcast_to(np.array(given), n)
-
-    def _size(self, name: str, otherwise: Floats | float = 0.0) -> Floats:
-        """Return the size of a noise: by calibration, else by the parameter, else `otherwise`."""
-        given, found = self._values(name), getattr(self.calibration, name)
-        return np.where(found > 0.0, found, np.where(given > 0.0, given, otherwise))
 
     def reset(self) -> None:
         """Begin anew with the next sample."""

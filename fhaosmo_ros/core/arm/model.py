@@ -249,8 +249,8 @@ class Calibration:
     coulomb: Floats  # (n, k) friction for tanh(velocity / width) with each of `WIDTHS`, N m
     torque_constants: Floats  # (n,) N m for one unit of effort
     position_noise: Floats  # (n,) as the parameter, which counts where this is 0
-    torque_noise: Floats  # (n,) likewise
-    model_error: Floats  # (n,) likewise
+    torque_noise: Floats  # (n,) from sample to sample, N m; 0: not known
+    model_error: Floats  # (n,) of the torque that is left unexplained, N m; 0: not known
     log_odds: float | Floats = 0.0  # of contact, once a minute in the free motion; 0: not known
 
     @classmethod

@@ -25,7 +25,7 @@ ARM = (
               "Mass (kg) and centre (m) of what the last link carries, in that joint's frame.",
               lower=-1e4, upper=1e4, lengths='4'),
     Parameter('calibration_file', '',
-              'YAML file of `calibrate`, whose noises and model error win; empty: the URDF alone.',
+              'YAML file of `calibrate`, whose noise of positions wins; empty: the URDF alone.',
               live=False),
     Parameter('position_noise', [2e-5],
               'Standard deviation of the noise of a position, at least: a step of the encoder '
@@ -34,10 +34,6 @@ ARM = (
     Parameter('velocity_noise', [1e-3],
               'Standard deviation of the noise of a velocity, at least; more is found.',
               unit='rad/s', lower=1e-9, upper=100.0, live=False, lengths='1 or n'),
-    Parameter('model_error', [0.0],
-              'Standard deviation of the torque that the model does not explain in free motion, '
-              "such as friction; 0 for 1.5 % of the torque of the arm's own weight.", unit='N m',
-              lower=0.0, upper=1e6, live=False, lengths='1 or n'),
     Parameter('false_alarms_per_minute', 1.0,
               'How often contact may be reported in free motion.', lower=1e-3, upper=60.0),
 )  # fmt: skip

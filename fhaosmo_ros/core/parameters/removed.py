@@ -33,6 +33,7 @@ REMOVED = {
     'hardware_id': "leave it out: reports have 'none'",
     'warn_rate_below': 'leave it out: /diagnostics has the sample rate as a number',
     'warn_jitter_above': 'leave it out: WARN above 0.5',
+    'model_error': "leave it out: 'calibrate' finds it; see 'false_alarms_per_minute'",
     'torque_noise': 'leave it out: the noise of torques is found from the samples',
     'warn_delay_above': 'leave it out: WARN above 0.1 s',
 }
