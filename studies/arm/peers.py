@@ -36,8 +36,7 @@ def momentum(model: ArmModel, w: Touched, by_position: bool) -> Momentum:
     velocity = moved / PERIOD if by_position else w.velocity
     terms = [model.terms(q, v) for q, v in zip(w.q, velocity, strict=True)]
     mass = np.array([x.mass for x in terms])
-    turned = [v @ x.coriolis for v, x in zip(velocity, terms, strict=True)]
-    u = w.torque + turned - np.array([x.gravity for x in terms])
+    u = w.torque + np.array([x.turning - x.gravity for x in terms])
     u[1:] = 0.5 * (u[1:] + u[:-1])
     between = 0.5 * (mass + np.concatenate([mass[:1], mass[:-1]]))
     p, y = ((m @ x[..., None])[..., 0] for m, x in ((mass, velocity), (between, moved)))

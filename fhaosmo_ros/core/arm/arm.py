@@ -225,7 +225,9 @@ class Arm:
         known = self._time - self._delay
         while self._waiting and self._waiting[0][0] <= known and not self.problem:
             time, stamp, h, vague, sample = self._waiting.popleft()
-            torque = latest[0] + (known - time) / samples.h * (self._torque - latest[0])
+            torque = latest[0]
+            if time < known:
+                torque = torque + (known - time) / samples.h * (self._torque - torque)
             found = self._go_on(torque, stamp, h, vague, sample)
         self._torque = latest[0]
         return found
@@ -234,7 +236,7 @@ class Arm:
         self, torque: Floats, stamp: int, h: float, vague: float, sample: Floats
     ) -> ArmEstimate | None:
         """Go on to a sample, `h` seconds after the one before; see `Samples`."""
-        _, q, velocity, way = sample
+        q, velocity, way = sample[1], sample[2], sample[3]
         bank, samples, before = self._bank, self._samples, self._velocity
         if before is None or not self._of_position:
             known = self._sliding = way / h if self._of_position else velocity
@@ -247,8 +249,9 @@ class Arm:
                 news = way / h - ahead
                 self._sliding = ahead + (1.0 - keep**2) * news
                 self._faster = self._faster + (1.0 - keep) ** 2 / h * news
-        mass, coriolis, gravity = self.model.terms(q, known)
-        drive = torque + known @ coriolis - self._tare
+        mass, turning, gravity = self.model.terms(q, known)
+        drive = torque + turning
+        drive -= self._tare
         if self._with_gravity:
             drive -= gravity
         if self._calibrated:

@@ -31,7 +31,7 @@ class Doubts:
     def __init__(self, model: ArmModel, with_gravity: bool, error: Floats) -> None:
         self._model, self._with_gravity, self._error = model, with_gravity, error
         self._time = 0.0
-        self._sums: list[Any] = [0.0] * 8
+        self._sums: list[Any] = [0.0] * 6
         self.text, self.payload = '', False
 
     def take(self, h: float, q: Floats, effort: Floats, torque: Floats) -> None:
@@ -42,9 +42,9 @@ class Doubts:
         keep, self._time = np.exp(-self._time / MEMORY), 0.0
         rest, last = np.zeros(len(q)), 10 * (len(q) - 1)
         payload = self._model.regressor(q, rest, rest)[:, last : last + 4]
-        columns = np.column_stack([self._model.gravity_columns(q), -payload])
+        columns = np.column_stack([self._model.gravity_columns(q), -payload, np.diag(effort)])
         a, scaled = columns / self._error[:, np.newaxis], torque / self._error
-        news = 1.0, q, q**2, effort * torque, effort**2, scaled**2, a.T @ a, a.T @ scaled
+        news = 1.0, q, q**2, scaled**2, a.T @ a, a.T @ scaled
         self._sums = [keep * old + new for old, new in zip(self._sums, news, strict=True)]
         if EVERY * self._sums[0] > LEAST:
             self.payload = False
@@ -52,7 +52,8 @@ class Doubts:
 
     def _explanation(self) -> str:
         """Return what explains the torque, if something does."""
-        count, mean, square, both, own, squares, normal, seen = self._sums
+        count, mean, square, squares, normal, seen = self._sums
+        own = np.diag(normal)[7:]  # of efforts
         moved = np.max(square / count - (mean / count) ** 2) > MOVED**2
         if moved and not own.any():
             return 'all efforts are zero: does the driver measure them?'
@@ -85,9 +86,9 @@ class Doubts:
             if cosine < 0.98 and 0.7 < size < 1.4:
                 text = ', '.join(f'{x:.1f}' for x in gravity)
                 return f"gravity is as if it were [{text}] in the base's frame: parameter gravity"
-        slopes = both / np.maximum(own, 1e-12)
+        slopes = seen[7:] / np.maximum(own, 1e-12)
         reverses = (np.abs(slopes + 2.0) < 0.5) & (squares > LARGE**2 * count)
-        wrong = reverses & (both * slopes / self._error**2 > EXPLAINED * squares)
+        wrong = reverses & (seen[7:] * slopes > EXPLAINED * squares)
         if wrong.any():
             names = ', '.join(np.array(self._model.joints)[wrong])
             return f'the effort of {names} has the wrong sign'

@@ -32,7 +32,7 @@ class Terms(NamedTuple):
     """The equation M(q) qdd + C(q, qd) qd + g(q) = torque at one posture and velocity."""
 
     mass: Floats  # (n, n) M, kg m^2 (kg for a prismatic joint)
-    coriolis: Floats  # (n, n) C, N m s: C^T qd drives p = M qd beside torque and gravity
+    turning: Floats  # (n,) C^T qd, N m: drives p = M qd beside torque and gravity
     gravity: Floats  # (n,) g, N m
 
 
@@ -175,9 +175,9 @@ class ArmModel:
     def terms(self, q: Floats, velocity: Floats) -> Terms:
         """Return the terms at q (n,) and its velocity (n,)."""
         at = self._at(q)
-        coriolis = pin.computeCoriolisMatrix(*at, velocity).copy()
+        turning = velocity.dot(pin.computeCoriolisMatrix(*at, velocity))
         gravity = pin.computeGeneralizedGravity(*at).copy()
-        return Terms(pin.crba(*at).copy(), coriolis, gravity)
+        return Terms(pin.crba(*at).copy(), turning, gravity)
 
     def velocity_of(self, momentum: Floats) -> Floats:
         """Return M^-1 p of p (n,), at the posture of the latest `terms`."""
