@@ -209,27 +209,21 @@ class Arm:
         problem = samples.take(stamp, effort, q, speed, self._velocity, self._bank.mean[1])
         self.problem = '' if problem == 'first' else problem
         if not problem:
-            found = self._go_on_to_torque(stamp)
+            latest = samples.latest.copy()  # the next sample is written over it
+            self._time += samples.h
+            self._waiting.append((self._time, stamp, samples.h, samples.vague, latest))
+            known = self._time - self._delay  # when the latest torque was measured
+            while self._waiting and self._waiting[0][0] <= known and not self.problem:
+                time, at, h, vague, sample = self._waiting.popleft()
+                torque = latest[0]
+                if time < known:
+                    torque = torque + (known - time) / samples.h * (self._torque - torque)
+                found = self._go_on(torque, at, h, vague, sample)
+            self._torque = latest[0]
         if self.problem in ANEW:
             self._forget()
         if self.problem or found is not None:
             self.counters[self.problem or 'used'] += 1
-        return found
-
-    def _go_on_to_torque(self, stamp: int) -> ArmEstimate | None:
-        """Go on to samples whose torque is known now: the latest one's is `torque_delay` old."""
-        samples, found = self._samples, None
-        latest = samples.latest.copy()  # the next sample is written over it
-        self._time += samples.h
-        self._waiting.append((self._time, stamp, samples.h, samples.vague, latest))
-        known = self._time - self._delay
-        while self._waiting and self._waiting[0][0] <= known and not self.problem:
-            time, stamp, h, vague, sample = self._waiting.popleft()
-            torque = latest[0]
-            if time < known:
-                torque = torque + (known - time) / samples.h * (self._torque - torque)
-            found = self._go_on(torque, stamp, h, vague, sample)
-        self._torque = latest[0]
         return found
 
     def _go_on(

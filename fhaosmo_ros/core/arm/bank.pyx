@@ -45,14 +45,14 @@ cdef class Bank:
 
     """
 
-    cdef readonly int joints, filters
-    cdef readonly bint of_position
+    cdef int joints, filters
+    cdef bint of_position
     cdef readonly double log_odds  # of contact against free motion
     cdef readonly object mean  # (3, n): Y less what was measured, p and d
     cdef readonly object covariance  # (n, n) of d, if the likeliest filter is right
-    cdef readonly object weights  # (m + 1,), the first of free motion
     cdef double decay, begin, end, change, onset, since
-    cdef double[::1] free, measured, average, w
+    cdef double[::1] free, measured, average
+    cdef double[::1] w  # weight of each filter, the first of free motion
     cdef double[::1] scales  # scale^2 of each filter
     # Of each filter, and of what those of contact have in common: Y of all joints, p of all and
     # d of all, and below their covariance.
@@ -84,8 +84,7 @@ cdef class Bank:
         self.work = np.zeros((n, 4 * n + 1))
         self.mean, self.covariance = np.zeros((3, n)), np.zeros((n, n))
         self.average, self.spread = self.mean.reshape(-1), self.covariance
-        self.weights, self.mixed, self.anew, self.likelihood = np.zeros((4, m))
-        self.w = self.weights
+        self.w, self.mixed, self.anew, self.likelihood = np.zeros((4, m))
         self.mass, self.middle, self.noise = np.zeros((3, n, n))
         self.drive, self.mean_drive, self.measured = np.zeros((3, n))
         self.start(0.0, 0.0, np.zeros(n), np.zeros((n, n)), np.zeros(n))
@@ -104,8 +103,8 @@ cdef class Bank:
         s[:, 0, n : 2 * n] = momentum
         s[:, 1 + n : 1 + 2 * n, n : 2 * n] = momentum_covariance
         s[:, 1 + 2 * n :, 2 * n :] = np.diag(torque_variance)
-        self.weights[...] = SMALLEST
-        self.weights[0] = 1.0
+        self.w[:] = SMALLEST
+        self.w[0] = 1.0
         self.log_odds = log(SMALLEST)
         self.mean[...] = s[0, 0].reshape(3, n)
         self.covariance[...] = s[0, 1 + 2 * n :, 2 * n :]
