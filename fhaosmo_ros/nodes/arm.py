@@ -7,7 +7,7 @@ from time import perf_counter
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
-from fhaosmo_ros.core.arm.arm import ANEW, Arm, ArmEstimate, payload_of, text_of
+from fhaosmo_ros.core.arm.arm import Arm, ArmEstimate, payload_of, text_of
 from fhaosmo_ros.core.parameters.declaration import Parameters, Value
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.messages.joints import joint_sample
@@ -38,7 +38,8 @@ SERVICES = {
 MEANT = {
     'beyond limits': 'positions lie beyond the limits of the URDF: are they in degrees, or is it '
     'another robot?',
-    'jumped': 'positions jumped faster than three times the velocity limit of the URDF',
+    'jumped': 'positions jumped faster than three times the velocity limit of the URDF: the '
+    'estimates began anew',
     'not finite': 'positions, efforts or velocities are NaN or infinite',
     'not newer': 'the stamp is not later than that of the sample before',
     'too strong': 'efforts are a hundred times those of the URDF: what is the unit of effort?',
@@ -46,9 +47,9 @@ MEANT = {
     'standing still': 'positions stay the same to the last digit though the arm was moving: is '
     'the driver stuck?',
     'diverged': 'the estimated velocity became more than three times the limit of the URDF (are '
-    'stamps and efforts right?)',
-    'clock set back': 'stamps are more than 0.1 s older than before',
-    'restarts': 'a gap of more than 0.1 s',
+    'stamps and efforts right?): the estimates began anew',
+    'clock set back': 'stamps are more than 0.1 s older than before: the estimates began anew',
+    'restarts': 'a gap of more than 0.1 s: the estimates began anew',
 }
 """What the counters of `Arm` mean."""
 
@@ -129,14 +130,11 @@ class ArmNode(BaseNode):
             return
         estimate = arm.take(stamp, *arrays)
         if arm.problem in MEANT:
-            anew = ': the estimates began anew' if arm.problem in ANEW else ''
             got = ', '.join(
                 f'{what} {" ".join(f"{x:.3g}" for x in numbers)}'
                 for what, numbers in zip(('position', 'effort', 'velocity'), arrays, strict=False)
             )
-            count = arm.counters[arm.problem]
-            text = f'{MEANT[arm.problem]}{anew} ({count} so far; got {got})'
-            self._problems[arm.problem] = text
+            self._problems[arm.problem] = f'{MEANT[arm.problem]} (got {got})'
         if arm.doubts.text:
             self._problems['doubts'] = arm.doubts.text
         if estimate is None:

@@ -176,7 +176,7 @@ cdef class Samples:
         if self.period == 0.0:
             self.period = self.h
         if fabs(self.late) > 0.5 * self.period and fabs(self.h - self.period) < 0.5 * self.period:
-            self.late = 0.0  # the clock was set
+            self.late = 0.0  # the clock was set, or the host hangs no more
         for k in range(velocity.shape[0]):
             along += self.moved[k] * velocity[k]
             square += velocity[k] * velocity[k]
@@ -190,12 +190,12 @@ cdef class Samples:
         if agrees or (count == 1.0 and fabs(off) <= NEAR * self.period):
             self.h = h
             self.period += QUICKEN * off / count
-            if fabs(off) <= NEAR * self.period:
+            if fabs(off) <= NEAR * self.period:  # else there is another rate now
                 self.h -= (1.0 - FOLLOW) * off
                 off = fmin(off * off, LARGEST * self.jitter + 1e-14)
                 self.jitter += (off - self.jitter) / self.count
             unsure = self.jitter if count == 1.0 else self.jitter + miss
-        else:
+        else:  # the sample says next to nothing of the velocity
             self.period += QUICKEN * (fmin(fmax(told, self.h), 2.0 * self.period) - self.period)
             self.h, unsure = told, told * told
         self.late = h - self.h
