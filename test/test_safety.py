@@ -145,7 +145,7 @@ def test_compiled_code_takes_no_arrays_of_other_sizes():
     smoother = running(KINDS['smoothed'], 300, 5).smoothing
     for call, *arguments in (
         (policy.run, STAMPS[:2], Y, none), (policy.run, STAMPS, Y, np.zeros((200, 2))),
-        (Plant()._system.advance, Y, Y), (Samples, *[three] * 5, True),
+        (Plant()._system.advance, Y, Y), (Samples, *[three] * 6, True),
         (smoother._passes.forward, three), (LinearModel, np.eye(18), 1.0),
         *((phi.Expressions, [[(int(code), 1)]], 1, 1) for code in (phi.ADD, phi.STATE)),
     ):  # fmt: skip

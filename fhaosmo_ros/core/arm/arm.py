@@ -142,6 +142,7 @@ class Arm:
             2.0 * DECAY * self._model_variance, DECAY, np.array(INTENSITIES) * model.weight, RATES,
             self._samples.variance, ONSET, SINCE if self._of_position else 0.0, self._of_position,
         )  # fmt: skip
+        self._momentum, self._external = self._bank.mean[1:]  # written anew by each step
         self._rest, self._tare = np.zeros((2, n))
         self.counters: Counter[str] = Counter()
         self.problem = ''
@@ -179,7 +180,7 @@ class Arm:
 
     def tare(self) -> None:
         """Take the present external torque for zero from now on."""
-        now = self._bank.mean[2].copy()
+        now = self._external.copy()
         self._tare -= now
         self._bank.shift(now)
 
@@ -206,7 +207,7 @@ class Arm:
         """
         samples, found = self._samples, None
         speed = self._rest if self._of_position else velocity
-        problem = samples.take(stamp, effort, q, speed, self._velocity, self._bank.mean[1])
+        problem = samples.take(stamp, effort, q, speed, self._velocity, self._momentum)
         self.problem = '' if problem == 'first' else problem
         if not problem:
             latest = samples.latest.copy()  # the next sample is written over it
@@ -258,11 +259,11 @@ class Arm:
             bank.start(mass, drive, mass @ known, spread, self._model_variance)
         change = way if self._of_position else velocity
         bank.step(h, mass, change, vague, drive, self._reach)
-        self.doubts.take(h, q, torque, bank.mean[2])
+        self.doubts.take(h, q, torque, self._external)
         if self.doubts.text and not self.doubts.payload:
             self.problem = 'doubted'
             return None
-        self._velocity = self.model.velocity_of(bank.mean[1])
+        self._velocity = self.model.velocity_of(self._momentum)
         if not samples.is_possible(2, self._velocity):  # C^T qd grows with its square
             samples.reset()
             self.problem = 'diverged'
@@ -272,7 +273,7 @@ class Arm:
     def _estimate(self, stamp: int, q: Floats, velocity: Floats) -> ArmEstimate:
         """Return what the bank says, and the likeliest link by all that it said in a contact."""
         bank, touched = self._bank, self._contact
-        odds, torques, covariance = bank.log_odds, bank.mean[2].copy(), bank.covariance.copy()
+        odds, torques, covariance = bank.log_odds, self._external.copy(), bank.covariance.copy()
         self._contact = odds > (0.0 if touched else self._threshold)
         every = LOOK_CLOSELY if self._contact else LOOK
         if self._contact != touched or stamp - self._looked >= every * 1e9:
