@@ -14,6 +14,7 @@ from fhaosmo_ros.core.arm.model import ArmModel, Calibration, Floats, WIDTHS
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.linalg import block_diag
 from scipy.optimize import least_squares
 from scipy.signal import butter, sosfiltfilt
 
@@ -249,32 +250,32 @@ class _Regression:
         every mass matrix is. The alternating direction method of multipliers finds the least of
         x^T normal x / 2 - right^T x there.
         """
-        n, bodies = len(self.size), self._scale[: 10 * len(self.size)]
-        links, shape = self._model.unloaded, self._model.pseudo_inertias()
+        n = len(self.size)
+        links = self._model.unloaded
         unit = np.sqrt(np.maximum(links[:, :1], 1e-3)) * np.array([LEVER, LEVER, LEVER, 1.0])
         units = unit[:, :, np.newaxis] * unit[:, np.newaxis, :]
-        to_inertial = np.linalg.pinv(shape.reshape(16, 10))
-
-        def nearest(x: Floats) -> Floats:
-            """Return factors of links and rotors that can exist."""
-            own = links + (bodies * x[: 10 * n]).reshape(n, 10)
-            values, vectors = np.linalg.eigh(np.einsum('abk,ik->iab', shape, own) / units)
-            clipped = vectors * np.maximum(values, LEAST_SHARE)[:, np.newaxis]
-            clipped = units * (clipped @ vectors.transpose(0, 2, 1))
-            change = (to_inertial @ clipped.reshape(n, 16, 1))[..., 0] - links
-            rotors = np.maximum(x[10 * n : 11 * n], 0.0)
-            return np.concatenate([change.ravel() / bodies, rotors, x[11 * n :]])
-
+        shape = self._model.pseudo_inertias() / units[..., np.newaxis]
+        of_links = block_diag(*shape.reshape(n, 16, 10)) * self._scale[: 10 * n]
+        map_ = np.zeros((17 * n, len(right)))
+        map_[:, : 11 * n] = block_diag(of_links, np.eye(n))
+        start = np.concatenate([np.einsum('iabk,ik->iab', shape, links).ravel(), np.zeros(n)])
         # As stiff as the data in the middle between the directions it knows well and hardly.
         rate = float(np.sqrt(np.prod(np.linalg.eigvalsh(normal)[[0, -1]])))
-        stiff = np.where(np.arange(len(right)) < 11 * n, rate, 0.0)
-        inverse = np.linalg.inv(normal + np.diag(stiff))
-        near, dual = np.zeros((2, len(right)))
+        inverse = np.linalg.inv(normal + rate * map_.T @ map_)
+        near, dual = start, np.zeros(len(start))
         for _ in range(SWEEPS):
-            x = inverse @ (right + stiff * (near - dual))
-            near = nearest(x + dual)
-            dual += x - near
-        return near
+            x = inverse @ (right + rate * map_.T @ (near - start - dual))
+            there = start + map_ @ x + dual
+            values, vectors = np.linalg.eigh(there[: 16 * n].reshape(n, 4, 4))
+            clipped = vectors * np.maximum(values, LEAST_SHARE)[:, np.newaxis]
+            clipped = clipped @ vectors.transpose(0, 2, 1)
+            near = np.concatenate([clipped.ravel(), np.maximum(there[16 * n :], 0.0)])
+            dual = there - near
+        body, other = slice(0, 11 * n), slice(11 * n, None)
+        x[body] = np.linalg.lstsq(map_[:, body], near - start, rcond=None)[0]
+        coupled = normal[other, body] @ x[body]
+        x[other] = np.linalg.solve(normal[other, other], right[other] - coupled)
+        return np.asarray(x)
 
 
 def _rms(values: Floats) -> Floats:

@@ -175,14 +175,17 @@ cdef class Samples:
         cdef Py_ssize_t k
         if self.period == 0.0:
             self.period = self.h
-        if fabs(self.late) > 0.5 * self.period and fabs(self.h - self.period) < 0.5 * self.period:
-            self.late = 0.0  # the clock was set, or the host hangs no more
         for k in range(velocity.shape[0]):
             along += self.moved[k] * velocity[k]
             square += velocity[k] * velocity[k]
             noise += self.found[1, k]
         h = self.h + self.late
         told = along / square if along > 0.0 else fmax(h, self.h)
+        if (
+            fabs(self.h - self.period) < 0.5 * self.period < fabs(self.late)
+            and fabs(self.h - told) < fabs(h - told)
+        ):
+            h = self.h  # the clock was set
         miss = (h - told) ** 2
         agrees = h > 0.0 and miss * square <= AGREES * (noise + self.jitter * square)
         count = fmax(1.0, floor(h / self.period + 0.5))
