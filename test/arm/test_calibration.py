@@ -126,14 +126,11 @@ def test_commands_calibrate_find_a_payload_and_replay_a_bag(tmp_path, capsys):
     held_out = capsys.readouterr().out
     known = ['-p', f'calibration_file:={file}']
     assert calibrate.main(['--bag', str(bag), '--payload', *known]) == 0
-    held_out, other = (
-        [line.split()[1:3] for line in said.splitlines() if line.startswith(JOINTS)]
-        for said in (held_out, capsys.readouterr().out)
-    )
     left = [
-        [float(held[1]), float(without[0])] for held, without in zip(held_out, other, strict=True)
+        [float(line.split()[column]) for line in said.splitlines() if line.startswith(JOINTS)]
+        for said, column in ((held_out, 2), (capsys.readouterr().out, 1))
     ]
-    np.testing.assert_allclose(*np.transpose(left), rtol=0.2)
+    np.testing.assert_allclose(*left, rtol=0.2)
     assert (tmp_path / 'three.png').stat().st_size > 10_000
     assert replay.main([str(bag), '-o', str(table), *known]) == 0
     rows = np.genfromtxt(table, delimiter=',', skip_header=1, usecols=range(7))

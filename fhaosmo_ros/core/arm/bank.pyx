@@ -48,7 +48,7 @@ cdef class Bank:
     cdef int joints, filters
     cdef bint of_position
     cdef readonly double log_odds  # of contact against free motion
-    cdef readonly object mean  # (3, n): Y less what was measured, p and d
+    cdef readonly object mean  # (3, n): Y, of positions less what was measured, p and d
     cdef readonly object covariance  # (n, n) of d, if the likeliest filter is right
     cdef double decay, begin, end, change, onset, since
     cdef double[::1] free, measured, average
