@@ -345,6 +345,7 @@ cdef inline void carry(double* p, Py_ssize_t n, double h, double stay) noexcept 
 
 cdef void grow(double* p, double t) noexcept nogil:
     """Write the covariance of Y, p and d that white noise of d' makes within t seconds."""
-    p[0], p[1], p[2] = t**5 / 20.0, t**4 / 8.0, t**3 / 6.0
-    p[3], p[4], p[5] = p[1], t**3 / 3.0, t**2 / 2.0
+    cdef double t2 = t * t, t3 = t * t * t
+    p[0], p[1], p[2] = t2 * t3 / 20.0, t2 * t2 / 8.0, t3 / 6.0
+    p[3], p[4], p[5] = p[1], t3 / 3.0, t2 / 2.0
     p[6], p[7], p[8] = p[2], p[5], t
