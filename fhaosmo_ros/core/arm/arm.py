@@ -4,6 +4,7 @@
 from collections import Counter, deque
 from collections.abc import Mapping
 from pathlib import Path
+from threading import RLock
 from typing import Any, NamedTuple
 
 from fhaosmo_ros.core.arm.bank import Bank
@@ -107,7 +108,7 @@ class Arm:
         self.joints, n = model.joints, len(model.joints)
         if calibration is None and p['calibration_file']:
             calibration = Calibration.loads(text_of(p, 'calibration_file', 'a YAML file'))
-        self._calibrated = calibration is not None
+        self._calibrated, self._alone = calibration is not None, RLock()  # a second thread waits
         known = self.calibration = calibration or Calibration.of_urdf(model)
         if known.joints != model.joints:
             own, got = ', '.join(model.joints), ', '.join(known.joints)
@@ -157,8 +158,9 @@ class Arm:
 
     def reset(self) -> None:
         """Begin anew with the next sample."""
-        self._samples.reset()
-        self._forget()
+        with self._alone:
+            self._samples.reset()
+            self._forget()
 
     def _forget(self) -> None:
         # Samples that wait for their torque: time (s), stamp, `h`, `vague` and `latest`. Then the
@@ -173,16 +175,18 @@ class Arm:
 
     def adopt(self, parameters: Parameters) -> None:
         """Go on with other live parameters; raise ConfigurationError for a bad payload."""
-        self.model.set_payload(payload_of(parameters))
+        with self._alone:
+            self.model.set_payload(payload_of(parameters))
         self.parameters = ARM_PARAMETERS.complete(parameters)
         rare = np.log(parameters['false_alarms_per_minute'])
         self._threshold = (self.calibration.log_odds or ODDS) - rare
 
     def tare(self) -> None:
         """Take the present external torque for zero from now on."""
-        now = self._external.copy()
-        self._tare -= now
-        self._bank.shift(now)
+        with self._alone:
+            now = self._external.copy()
+            self._tare -= now
+            self._bank.shift(now)
 
     def take(
         self, stamp: int, q: ArrayLike, effort: ArrayLike, velocity: ArrayLike | None = None
@@ -205,27 +209,28 @@ class Arm:
             None where there is none yet, or the sample was not used; `problem` says why.
 
         """
-        samples, found = self._samples, None
-        speed = self._rest if self._of_position else velocity
-        problem = samples.take(stamp, effort, q, speed, self._velocity, self._momentum)
-        self.problem = '' if problem == 'first' else problem
-        if not problem:
-            latest = samples.latest.copy()  # the next sample is written over it
-            self._time += samples.h
-            self._waiting.append((self._time, stamp, samples.h, samples.vague, latest))
-            known = self._time - self._delay  # when the latest torque was measured
-            while self._waiting and self._waiting[0][0] <= known and not self.problem:
-                time, at, h, vague, sample = self._waiting.popleft()
-                torque = latest[0]
-                if time < known:
-                    torque = torque + (known - time) / samples.h * (self._torque - torque)
-                found = self._go_on(torque, at, h, vague, sample)
-            self._torque = latest[0]
-        if self.problem in ANEW:
-            self._forget()
-        if self.problem or found is not None:
-            self.counters[self.problem or 'used'] += 1
-        return found
+        with self._alone:
+            samples, found = self._samples, None
+            speed = self._rest if self._of_position else velocity
+            problem = samples.take(stamp, effort, q, speed, self._velocity, self._momentum)
+            self.problem = '' if problem == 'first' else problem
+            if not problem:
+                latest = samples.latest.copy()  # the next sample is written over it
+                self._time += samples.h
+                self._waiting.append((self._time, stamp, samples.h, samples.vague, latest))
+                known = self._time - self._delay  # when the latest torque was measured
+                while self._waiting and self._waiting[0][0] <= known and not self.problem:
+                    time, at, h, vague, sample = self._waiting.popleft()
+                    torque = latest[0]
+                    if time < known:
+                        torque = torque + (known - time) / samples.h * (self._torque - torque)
+                    found = self._go_on(torque, at, h, vague, sample)
+                self._torque = latest[0]
+            if self.problem in ANEW:
+                self._forget()
+            if self.problem or found is not None:
+                self.counters[self.problem or 'used'] += 1
+            return found
 
     def _go_on(
         self, torque: Floats, stamp: int, h: float, vague: float, sample: Floats

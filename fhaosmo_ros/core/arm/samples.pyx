@@ -1,15 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """What samples of an arm say by themselves: which can be used, their noise, and their time."""
 
-from libc.math cimport fabs, floor, fmax, fmin, isnan, M_PI, NAN, sqrt
+from libc.math cimport fabs, floor, fmax, fmin, INFINITY, isnan, M_PI, NAN, sqrt
 
 import numpy as np
 
-# Shares of what a stamp is off the line by that its sample, and the period, are moved by; and of
-# a period, which it may be off.
-cdef double FOLLOW = 0.2, QUICKEN = 0.01, NEAR = 0.4
-# Variances by which an interval of stamps may differ from what the motion of the joints tells.
-cdef double AGREES = 25.0
+cdef int LONGEST = 200  # samples over which stamps are evened out
+# Even intervals are used where motion misses them by the factor at most; of what was remembered of
+# both kinds of intervals, KEEP is still remembered one sample later.
+cdef double BETTER = 0.8, KEEP = 0.995
+cdef int LEARNT = 20  # the even clock begins with the median of so many intervals
+cdef double MISSING = 0.7  # share of a period by which a stamp is late where a sample is missing
+# Square of the standard deviations by which joints may miss where their velocity would bring them.
+cdef double STRAIGHT = 100.0
 cdef double STEP = sqrt(12.0)  # of an encoder, in standard deviations of its error of rounding
 cdef double OFF = 3.0  # of these steps a position may be off, however near samples are
 cdef int MOST_REPEATS = 10  # so many times more a driver may publish what it has read
@@ -21,6 +24,100 @@ cdef double MAX_GAP = 0.1  # s without a sample, or back in time, after which on
 
 FAULTS = ('too strong', 'beyond limits', 'too fast')
 """What an effort, a position and a velocity can be that no arm has."""
+
+
+cdef class Clock:
+    """
+    The time between two samples, where stamps jitter more than the sampling does.
+
+    Many drivers sample by a clock of the robot's controller, and stamp what they got when a thread
+    of the host wakes up. A stamp that is 0.1 ms off makes a velocity of 10 % more, for one sample.
+    So stamps are evened out, by the least squares of a line (constant period) over the last
+    samples, written as an alpha-beta filter; whole periods may be missing. Intervals are those of
+    the stamps or even ones, whichever agree better with how the joints move on.
+
+    A host that hangs stamps one sample late, and those after it at nearly the same time. Where
+    stamps and even clock do not agree to half a period, or samples seem to be missing, encoders
+    are the third clock: joints move on with their velocity, and how far they have moved tells the
+    time that has passed. Where that is as the stamp says, the even clock begins anew.
+    """
+
+    cdef bint even  # even intervals are used
+    cdef double vague  # share of what has moved at the latest sample that is not known
+    cdef double phase  # of the even clock, from the latest stamp (s)
+    cdef double period  # s
+    cdef int count  # stamps evened out
+    cdef list first  # intervals before the even clock begins
+    cdef double missed_by_stamps, missed_by_even  # rad^2, of the latest samples
+
+    def __cinit__(self):
+        self.first = []
+
+    cdef double interval(
+        self, double h, const double[::1] moved, const double[::1] velocity,
+        const double[::1] variance,
+    ):
+        """
+        Return the time in which the joints have `moved`; `h` is that of the stamps (s).
+
+        `velocity` is the one before, and `variance` that of the noise of positions.
+        """
+        cdef double total = 0.0, along = 0.0, square = 0.0, noise = 0.0, even
+        cdef double told = h, sure = INFINITY  # time by the motion, and how exact it is (s)
+        cdef Py_ssize_t k
+        for k in range(moved.shape[0]):
+            total += moved[k] * moved[k]
+            along += moved[k] * velocity[k]
+            square += velocity[k] * velocity[k]
+            noise += variance[k]
+        if square > 0.0:
+            told = along / square
+            if total - told * along <= STRAIGHT * noise:
+                sure = sqrt(LARGEST * noise / square)
+        even = self.evened(h, told, sure)
+        if fabs(h - even) > 0.5 * self.period or (self.count == 0 and sure < h):
+            if fabs(h - told) < fabs(even - told):
+                even = h
+            self.vague = fabs(even - told) / fmax(fabs(told), 1e-15)
+            return even
+        # By how much the joints miss where their velocity would have brought them.
+        self.missed_by_stamps *= KEEP
+        self.missed_by_stamps += total - 2.0 * h * along + h * h * square
+        self.missed_by_even *= KEEP
+        self.missed_by_even += total - 2.0 * even * along + even * even * square
+        self.even = self.missed_by_even < BETTER * self.missed_by_stamps
+        self.vague = fabs(h - even) / (even if self.even else h)
+        return even if self.even else h
+
+    cdef double evened(self, double h, double told, double sure):
+        """Go on by a stamp, `h` after the one before, and return the even interval."""
+        cdef double since = h - self.phase, off, even
+        cdef int steps, n
+        if self.count == 0:
+            self.first.append(h)
+            if len(self.first) == LEARNT:
+                self.period, self.phase = float(np.median(self.first)), 0.0
+                self.count, self.first = LEARNT // 2, []
+            return h
+        steps = max(1, int(since / self.period + 1.0 - MISSING))
+        off = since - steps * self.period
+        if (
+            fabs(steps * self.period - told) > sure
+            and (fabs(off) > 0.5 * self.period or told < (0.5 * steps + 1.0) * self.period)
+        ):
+            steps = max(1, <int> (fmin(told, since) / self.period + 0.5))
+            off = since - steps * self.period
+        if fabs(off) > 0.5 * self.period:  # says nothing, unless joints have moved as it says
+            even = steps * self.period
+            self.phase = 0.0 if fabs(h - even) < 0.5 * self.period else -off
+            if fabs(h - told) < fabs(even - told):
+                self.count = 0
+            return even
+        self.count = n = min(self.count + 1, LONGEST)
+        even = steps * self.period + 2.0 * (2.0 * n - 1.0) / (n * (n + 1.0)) * off
+        self.phase = even - since
+        self.period += 6.0 / (n * (n + 1.0)) * off / steps
+        return even
 
 
 cdef class Samples:
@@ -48,9 +145,7 @@ cdef class Samples:
     cdef int count  # samples over which noise is averaged
     cdef int repeats  # samples in a row that a driver has published once more
     cdef long long time, newest  # of the latest sample that counts, and of any
-    # The interval of samples by their stamps, and by how much the latest stamp is late (s); the
-    # variance of stamps.
-    cdef double period, late, jitter
+    cdef Clock clock
 
     def __cinit__(self, noise, least, limits, constants, stopping, turning, bint of_position):
         cdef Py_ssize_t n = len(constants)
@@ -72,7 +167,7 @@ cdef class Samples:
         """Take the next sample as the first one."""
         self.begun = self.still = False
         self.repeats = 0
-        self.period = self.late = self.jitter = 0.0
+        self.clock = Clock()
         self.past[:, :, :] = NAN
 
     cpdef bint is_possible(self, int row, const double[::1] values) except -1:
@@ -140,10 +235,11 @@ cdef class Samples:
             return 'standing still'
         if self.h > MAX_GAP:
             return self.begin(time, 'restarts')
-        self.tell_time(likely)
+        self.h = self.clock.interval(self.h, self.moved, likely, self.found[1])
+        self.vague = self.clock.vague if self.of_position else 0.0
         for k in range(n):
             if fabs(self.moved[k]) > (
-                self.highest[2, k] * fmax(self.h, self.period) + OFF * self.step[k]
+                self.highest[2, k] * self.h + OFF * self.step[k]
             ):
                 self.reset()
                 return 'jumped'
@@ -156,53 +252,6 @@ cdef class Samples:
         self.reset()
         self.begun, self.time, self.before[:] = True, time, self.now[1]
         return problem
-
-    cdef void tell_time(self, const double[::1] velocity):
-        """
-        Find out in which time the joints have moved, and how exactly that is known.
-
-        Many drivers sample by a clock of the robot's controller, and stamp what they got when a
-        thread of the host wakes up. A stamp that is 0.1 ms off makes a velocity of 10 % more, for
-        one sample. So samples follow a line through the stamps (an alpha-beta filter), in which
-        whole periods may be missing, and how far stamps are off it is noise of the time.
-
-        A host that hangs stamps one sample late, and those after it at nearly the same time; or
-        its clock is set. Where an interval is no period, joints tell the time: they move on with
-        the `velocity` that they had.
-        """
-        cdef double along = 0.0, square = 0.0, noise = 0.0, told, h, count, off, miss, unsure
-        cdef bint agrees
-        cdef Py_ssize_t k
-        if self.period == 0.0:
-            self.period = self.h
-        for k in range(velocity.shape[0]):
-            along += self.moved[k] * velocity[k]
-            square += velocity[k] * velocity[k]
-            noise += self.found[1, k]
-        h = self.h + self.late
-        told = along / square if along > 0.0 else fmax(h, self.h)
-        if (
-            fabs(self.h - self.period) < 0.5 * self.period < fabs(self.late)
-            and fabs(self.h - told) < fabs(h - told)
-        ):
-            h = self.h  # the clock was set
-        miss = (h - told) ** 2
-        agrees = h > 0.0 and miss * square <= AGREES * (noise + self.jitter * square)
-        count = fmax(1.0, floor(h / self.period + 0.5))
-        off = h - count * self.period
-        if agrees or (count == 1.0 and fabs(off) <= NEAR * self.period):
-            self.h = h
-            self.period += QUICKEN * off / count
-            if fabs(off) <= NEAR * self.period:  # else there is another rate now
-                self.h -= (1.0 - FOLLOW) * off
-                off = fmin(off * off, LARGEST * self.jitter + 1e-14)
-                self.jitter += (off - self.jitter) / self.count
-            unsure = self.jitter if count == 1.0 else self.jitter + miss
-        else:  # the sample says next to nothing of the velocity
-            self.period += QUICKEN * (fmin(fmax(told, self.h), 2.0 * self.period) - self.period)
-            self.h, unsure = told, told * told
-        self.late = h - self.h
-        self.vague = sqrt(unsure) / self.h if self.of_position else 0.0
 
     cdef void learn_noise(self):
         """Follow the variance of the noise by third differences."""
