@@ -303,6 +303,37 @@ def test_a_quantised_y_of_order_4(motion, noise):
         assert np.abs(found).max() < 2.0 * np.abs(d).max()
 
 
+@pytest.mark.parametrize('order', [3, 4])
+def test_late_stamps_where_y_begins_anew(order):
+    """How fast y moves is not known then, nor by what a late stamp puts it off: d was 1e3 d."""
+    model = np.diag(np.ones(order - 1), 1)
+    model[-1, -1] = -3.0
+    rng = np.random.default_rng(1)
+    d = matern(8_000, 1.0, 1, rng)
+    y = states_of(model, d, [0.1] * order)[:, 0]
+    for begin in range(2_500, 8_000, 500):
+        y[begin : begin + rng.integers(1, 60)] = 0.0
+    t = np.sort(np.arange(len(y)) * PERIOD + rng.exponential(0.1 * PERIOD, len(y)))
+    values = {'order': order, 'phi': ['0'] * (order - 1) + [f'-3*z{order}'], **SELF_TUNING}
+    wrong = (estimated(values, t, y).unknown_input - d)[2_000:]
+    assert rms(wrong) < rms(d)
+    assert np.abs(wrong).max() < 3.0 * np.abs(d).max()
+
+
+def test_a_covariance_that_rounding_has_spoilt_is_begun_anew():
+    """Without an end it would grow, and with it the estimate of a member that nobody believes."""
+    recording, values = study('pendulum')
+    estimator, stamps = OnlineEstimator(values), stamps_of(recording.t)
+    estimator.run(stamps[:4_000], recording.y[:4_000])
+    state = estimator.state_dict()
+    state['p_zz'][:, ::7] *= -1e30
+    estimator.load_state_dict(state)
+    found = estimator.run(stamps[4_000:6_000], recording.y[4_000:6_000]).unknown_input
+    assert rms(found - recording.d[4_000:6_000]) < 0.5 * rms(recording.d)
+    state = estimator.state_dict()
+    assert (state['p_zz'][[0, 2]] > 0.0).all()  # the diagonal, of two states
+
+
 @plants
 def test_how_sure_it_is_of_a_quantised_y(plant):
     """A mean over kinds of d; with one of the seeds members had once narrowed without end."""

@@ -11,7 +11,7 @@ from libc.math cimport M_2_PI, M_PI, copysign, erf, exp, fabs, fmax, log, sqrt
 from libc.stdlib cimport calloc, free
 
 from fhaosmo_ros.core.observer.self_tuning.members cimport (
-    COLOURS, COUNT, GRID, HALF, HUBER, INEXACT, ORDERS, Members, Work, entry, leeway, state
+    COLOURS, COUNT, GRID, HALF, HUBER, INEXACT, Members, Work, entry, go_on_from, leeway
 )
 from fhaosmo_ros.core.observer.self_tuning.weights cimport FLOOR, KEPT
 from fhaosmo_ros.core.vectors cimport VECTORISED
@@ -233,7 +233,7 @@ cdef bint choose_members(Members* m) noexcept nogil:
     Errors of rounding are not coloured noise. When y is quantised no more, members with coloured
     noise go on from those with white noise. Return True if it is others than before.
     """
-    cdef int before = m.shared.active, i, j, g, white
+    cdef int before = m.shared.active, i, g
     m.shared.active = HALF if m.work.sample.quanta > 0.0 else COUNT
     if m.shared.active < before:
         for g in range(HALF, COUNT):
@@ -244,14 +244,7 @@ cdef bint choose_members(Members* m) noexcept nogil:
             m.noise[i] = m.used_noise[i] = m.noise[0]
             m.late[i] = m.late[0]
         for g in range(HALF, COUNT):
-            white = GRID.white[g]
-            for i in range(m.n + ORDERS):
-                state(&m.x, m.n, i)[g] = state(&m.x, m.n, i)[white]
-                state(&m.gain, m.n, i)[g] = state(&m.gain, m.n, i)[white]
-                for j in range(i, m.n + ORDERS):
-                    entry(&m.p, m.n, i, j)[g] = entry(&m.p, m.n, i, j)[white]
-            m.variance[g], m.log_variance[g] = m.variance[white], m.log_variance[white]
-            m.residual[g], m.short_mean[g], m.far[g] = 0.0, 1.0, 0.0
+            go_on_from(m, g, GRID.white[g])
     return m.shared.active != before
 
 

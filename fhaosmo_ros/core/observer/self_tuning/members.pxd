@@ -186,6 +186,7 @@ cdef double factorial(int i) noexcept nogil
 cdef double power(double x, int count) noexcept nogil
 cdef void by_binomials(double* chain, int count, double more) noexcept nogil
 cdef void put(Members* m, int g, const double* estimate) noexcept nogil
+cdef void go_on_from(Members* m, int g, int other) noexcept nogil
 cdef VECTORISED predict_states(
     Members* m, const double* mean, const double* predicted
 ) noexcept nogil

@@ -122,6 +122,18 @@ cdef void put(Members* m, int g, const double* estimate) noexcept nogil:
         m.x.d[i][g] = chain[i] if i <= GRID.order[g] else 0.0
 
 
+cdef void go_on_from(Members* m, int g, int other) noexcept nogil:
+    """Let a member go on from where another one is, and as sure of it."""
+    cdef int i, j, n = m.n, most = n + GRID.order[g]
+    for i in range(n + ORDERS):
+        state(&m.x, n, i)[g] = state(&m.x, n, i)[other] if i <= most else 0.0
+        state(&m.gain, n, i)[g] = state(&m.gain, n, i)[other] if i <= most else 0.0
+        for j in range(i, n + ORDERS):
+            entry(&m.p, n, i, j)[g] = entry(&m.p, n, i, j)[other] if j <= most else 0.0
+    m.variance[g], m.log_variance[g] = m.variance[other], m.log_variance[other]
+    m.residual[g], m.short_mean[g], m.far[g] = 0.0, 1.0, 0.0
+
+
 # Prediction
 
 cdef VECTORISED predict_states(

@@ -13,8 +13,8 @@ from fhaosmo_ros.core.observer.self_tuning.jumps cimport (
 )
 from fhaosmo_ros.core.observer.self_tuning.members cimport (
     BANDS, CLOCKS, COLOURS, COUNT, DECAY, DIFFERENCES, EXACT, FIRST_SAMPLES, GRID, HALF, HUBER,
-    IN_BAND, MOST_ORDER, MOST_STATES, ORDERS, WINDOW, Line, Members, Sample, Shared, Work,
-    correct, correct_states, entry, expect, predict_states, put
+    IN_BAND, INEXACT, MOST_ORDER, MOST_STATES, ORDERS, WINDOW, Line, Members, Sample, Shared, Work,
+    correct, correct_states, entry, expect, go_on_from, predict_states, put
 )
 from fhaosmo_ros.core.observer.self_tuning.noise cimport (
     APART, FADED, LATTICE_SHARE, ROUNDED, STEADY, bound_of_noise, fill_noise, find_knowing,
@@ -293,9 +293,12 @@ cdef class SelfTuning(Structure):
             if m.far[i] > LOST_SAMPLES:  # far off for long
                 m.far[i] = 0.0
                 put(m, i, mean)
+            if m.variance[i] <= INEXACT:  # rounding has made z_1 more than certain
+                go_on_from(m, i, shared.likeliest)
+                shared.unsettled = 0.0
 
     cdef double look(self, double h, const double* u) noexcept nogil:
-        """Predict the members over h, and by what the sample is off; return the speed of y."""
+        """Predict the members over h, and by what the sample is off; return y's speed, RMS."""
         cdef Members* m = self.members
         cdef Shared* shared = &m.shared
         cdef Work* w = &m.work
@@ -307,6 +310,7 @@ cdef class SelfTuning(Structure):
         sample.h = h
         self.carry_flow(h, u, same)
         speed = (self.prediction.z[0] - self.level[0].z_hat) / h
+        speed = sqrt(speed * speed + self.variances[1])
         if not shared.jitter * speed * speed <= LARGEST:  # of a prediction that has overflowed
             speed = sqrt(usual_speed(m))
         shared.of_stamps = shared.jitter * speed * speed
