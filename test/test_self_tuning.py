@@ -30,6 +30,15 @@ def study(plant, condition=AS_TUNED, kind='sine', seconds=20.0, seed=31):
     return recording(plant, condition, kind, seconds, seed), values
 
 
+def chain(order, rng):
+    """Return 8 s of y and d of integrators with a loss at the last one, and parameters for it."""
+    model = np.diag(np.ones(order - 1), 1)
+    model[-1, -1] = -3.0
+    d = matern(8_000, 1.0, 1, rng)
+    phi = ['0'] * (order - 1) + [f'-3*z{order}']
+    return states_of(model, d, [0.1] * order)[:, 0], d, {'order': order, 'phi': phi}
+
+
 def estimated(values, t, y):
     return OnlineEstimator(values).run(stamps_of(t), y)
 
@@ -289,16 +298,12 @@ def test_slow_motion_over_an_encoder(counts):
 @pytest.mark.parametrize('motion', [0.1, 0.5])
 def test_a_quantised_y_of_order_4(motion, noise):
     """Whoever takes each sample that comes again for news is sure of something wrong: 1e5 d."""
-    model = np.diag([1.0, 1.0, 1.0], 1)
-    model[3, 3] = -3.0
     for seed in range(3):
         rng = np.random.default_rng(seed)
-        d = matern(8_000, 1.0, 1, rng)
-        y = states_of(model, d, [0.1] * 4)[:, 0]
+        y, d, values = chain(4, rng)
         quantum = np.median(np.abs(np.diff(y))) / motion
         y = quantum * np.round(y / quantum + noise * rng.standard_normal(len(y)))
-        observer = Observer(SELF_TUNING, order=4, phi=['0', '0', '0', '-3*z4'])
-        found = observer.run(np.arange(len(y)) * PERIOD, y).unknown_input
+        found = Observer(SELF_TUNING, **values).run(np.arange(len(y)) * PERIOD, y).unknown_input
         assert rms(found - d) < 0.8 * rms(d)
         assert np.abs(found).max() < 2.0 * np.abs(d).max()
 
@@ -306,16 +311,12 @@ def test_a_quantised_y_of_order_4(motion, noise):
 @pytest.mark.parametrize('order', [3, 4])
 def test_late_stamps_where_y_begins_anew(order):
     """How fast y moves is not known then, nor by what a late stamp puts it off: d was 1e3 d."""
-    model = np.diag(np.ones(order - 1), 1)
-    model[-1, -1] = -3.0
     rng = np.random.default_rng(1)
-    d = matern(8_000, 1.0, 1, rng)
-    y = states_of(model, d, [0.1] * order)[:, 0]
+    y, d, values = chain(order, rng)
     for begin in range(2_500, 8_000, 500):
         y[begin : begin + rng.integers(1, 60)] = 0.0
     t = np.sort(np.arange(len(y)) * PERIOD + rng.exponential(0.1 * PERIOD, len(y)))
-    values = {'order': order, 'phi': ['0'] * (order - 1) + [f'-3*z{order}'], **SELF_TUNING}
-    wrong = (estimated(values, t, y).unknown_input - d)[2_000:]
+    wrong = (estimated(values | SELF_TUNING, t, y).unknown_input - d)[2_000:]
     assert rms(wrong) < rms(d)
     assert np.abs(wrong).max() < 3.0 * np.abs(d).max()
 

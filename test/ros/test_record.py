@@ -213,7 +213,7 @@ def test_run_leaves_a_report_a_figure_and_a_bag_but_no_process(tmp_path):
     found = [f'/estimator/{part}' for part in (*ESTIMATES, 'tuning', SNAPSHOT, PARAMETERS)]
     assert {'/y', '/plant/state', '/plant/unknown_input', *found} <= topics
     (live,) = observers(folder / 'bag', {'gains': 'self_tuning'})
-    assert len(live.stamps) > 100
+    assert len(live.stamps) > 300
     assert live.gamma is None
     late = live.stamps > live.stamps[0] + 3_000_000_000
     # Not d: other tests load the machine meanwhile, and its stamps jitter in bursts then.
