@@ -16,7 +16,7 @@ from rclpy.qos import ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 from running import as_time, ERROR, FED, joint_state, LATCHED, OK, SECOND, STALE, WARN
 from sensor_msgs.msg import JointState
-from std_msgs.msg import Float64, Float64MultiArray, Int64
+from std_msgs.msg import Float64, Float64MultiArray, Int64, String
 
 RATE = 200.0
 """Of the pair's plant."""
@@ -104,8 +104,10 @@ def test_publishers_are_named(user, estimator, stranger):
     assert found['publishers'] == 'none'
     rig.wait_said('[WARN]', 'input: no publisher of /heard/y')
 
+    stranger.create_publisher(String, '/heard/estimator/parameters', 10)
     unheard = stranger.create_publisher(Int64, '/heard/y', 10)
     for _ in range(2):
+        rig.wait_status('state', WARN, 'active; 2 nodes have this name, their estimates mix')
         rig.wait_status('input', ERROR, '/stranger', 'std_msgs/msg/Int64', 'std_msgs/msg/Float64')
     stranger.destroy_publisher(unheard)
     rig.wait_status('input', STALE, 'no publisher')

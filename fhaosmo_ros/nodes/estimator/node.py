@@ -18,7 +18,7 @@ from fhaosmo_ros.nodes.estimator.channel import Channel
 from fhaosmo_ros.nodes.estimator.outputs import parameter_text, TypedOutputs
 from fhaosmo_ros.nodes.estimator.sources import Source
 from fhaosmo_ros.nodes.middleware import diagnostics
-from fhaosmo_ros.nodes.middleware.diagnostics import ERROR, OK, Report, STALE
+from fhaosmo_ros.nodes.middleware.diagnostics import ERROR, OK, Report, STALE, WARN
 from fhaosmo_ros.nodes.middleware.endpoints import (
     full_name,
     OVERRIDABLE,
@@ -215,6 +215,9 @@ class EstimatorNode(ManagedNode):
         reports = [state]
         if self._channels:
             self._look()
+            nodes = self.count_publishers(self._parameters_topic.topic_name)
+            same = f'{nodes} nodes have this name, their estimates mix'
+            state.find(WARN, same, nodes > 1)
         if active:
             for channel in self._channels:
                 reports += channel.health.reports()
