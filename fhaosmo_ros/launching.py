@@ -19,7 +19,11 @@ COMMON = {
     'use_sim_time': ('', 'true: take the time from /clock; empty: as the file says'),
     'log_level': ('info', 'least severity that is logged'),
 }
-CHOICES = {'log_level': ['debug', 'info', 'warn', 'error', 'fatal']}
+BOOLEAN = ['', 'true', 'false', 'True', 'False']
+CHOICES = {
+    'log_level': ['debug', 'info', 'warn', 'error', 'fatal'],
+    **dict.fromkeys(('autostart', 'respawn', 'use_sim_time'), BOOLEAN),
+}
 """Arguments that may have some values only."""
 OF_LAUNCH = ('params_file', 'namespace', 'name', 'log_level', 'respawn')
 """Arguments that are no parameters of the node."""

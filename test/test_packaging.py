@@ -128,6 +128,9 @@ def started(monkeypatch):
             given[call.args[0]] = call.kwargs['default_value']
         assert set(arguments) <= set(given)
         given.update(arguments)
+        for call in launch.DeclareLaunchArgument.call_args_list:  # as launch does
+            if given[call.args[0]] not in (call.kwargs.get('choices') or given.values()):
+                raise ValueError(call.args[0])
         launch.OpaqueFunction.call_args.kwargs['function'](None)
         return [call.kwargs for call in launch.Node.call_args_list]
 
@@ -151,6 +154,8 @@ def test_launch_files_start_their_nodes_with_files_that_are_there(started, tmp_p
     assert node['respawn'] is True
     with pytest.raises(FileNotFoundError, match=f'params_file: .* got {tmp_path}'):
         started('estimator', params_file=str(tmp_path))
+    with pytest.raises(ValueError, match='respawn'):  # not taken for false
+        started('estimator', respawn='yes')
 
 
 FAKE = {
