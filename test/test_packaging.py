@@ -124,13 +124,11 @@ def started(monkeypatch):
         launch.LaunchConfiguration = lambda name: SimpleNamespace(perform=lambda _: given[name])
         path = ROOT / 'launch' / f'{name}.launch.py'
         runpy.run_path(str(path))['generate_launch_description']()
-        for call in launch.DeclareLaunchArgument.call_args_list:
-            given[call.args[0]] = call.kwargs['default_value']
-        assert set(arguments) <= set(given)
-        given.update(arguments)
-        for call in launch.DeclareLaunchArgument.call_args_list:  # as launch does
-            if given[call.args[0]] not in (call.kwargs.get('choices') or given.values()):
-                raise ValueError(call.args[0])
+        for (argument,), options in launch.DeclareLaunchArgument.call_args_list:
+            value = given[argument] = arguments.pop(argument, options['default_value'])
+            if value not in (options.get('choices') or [value]):  # as launch does
+                raise ValueError(argument)
+        assert not arguments
         launch.OpaqueFunction.call_args.kwargs['function'](None)
         return [call.kwargs for call in launch.Node.call_args_list]
 

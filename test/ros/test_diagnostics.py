@@ -179,15 +179,6 @@ def test_bad_samples_are_rejected_and_counted_and_many_are_an_error(fed):
     fed.wait_said('input: ', said)
 
 
-def test_gamma_is_held_while_its_rate_and_leakage_are_0(fed):
-    fed.parameters.set(gamma_rate=100.0, gamma_initial=0.6, gamma_dead_zone=0.0)
-    before = [fed.feed(0.2 + 0.1 * math.sin(k)) for k in range(12)][-1]
-    fed.parameters.set(gamma_rate=0.0, gamma_leakage=0.0)
-    assert fed.feed(0.5).gamma == before.gamma
-    fed.parameters.set(gamma_rate=100.0)
-    assert fed.feed(0.5).gamma != before.gamma
-
-
 def test_gap_stops_the_output_and_restarts_the_observer(fed):
     fed.parameters.set(max_gap=1.0, publish_on='timer')
     before = fed.count('restarts')
