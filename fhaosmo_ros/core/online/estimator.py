@@ -244,12 +244,8 @@ class OnlineEstimator:
         if math.isfinite(u):
             self.policy.arrays['u'][index] = u
         else:
-            self.reject_inputs(1)
-
-    def reject_inputs(self, count: int) -> None:
-        """Count values of u that were not finite."""
-        rejected = self.policy.counters['rejected_inputs'] + count
-        self.policy.counters |= {'rejected_inputs': rejected}
+            rejected = self.policy.counters['rejected_inputs'] + 1
+            self.policy.counters |= {'rejected_inputs': rejected}
 
     def update(self, stamp: int, y: float) -> Estimate | None:
         """

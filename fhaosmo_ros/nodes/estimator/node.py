@@ -19,12 +19,7 @@ from fhaosmo_ros.nodes.estimator.outputs import parameter_text, TypedOutputs
 from fhaosmo_ros.nodes.estimator.sources import Source
 from fhaosmo_ros.nodes.middleware import diagnostics
 from fhaosmo_ros.nodes.middleware.diagnostics import ERROR, OK, Report, STALE, WARN
-from fhaosmo_ros.nodes.middleware.endpoints import (
-    full_name,
-    OVERRIDABLE,
-    SENSOR_QOS,
-    set_period,
-)
+from fhaosmo_ros.nodes.middleware.endpoints import full_name, OVERRIDABLE, SENSOR_QOS, set_period
 from fhaosmo_ros.nodes.middleware.lifecycle import ManagedNode
 from fhaosmo_ros.nodes.middleware.spin import run_node
 from fhaosmo_ros.topics import PARAMETERS, STANDARD_DEVIATION
