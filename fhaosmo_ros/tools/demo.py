@@ -144,9 +144,11 @@ def _record(
             if stop.wait(0.02):
                 raise Stopped('before the first estimate, nothing written')
             if time.monotonic() > deadline:
-                raise ConfigurationError(
-                    f'waited {START_DEADLINE:g} s for the first estimate in vain'
-                )
+                publishers = recorder.node.count_publishers
+                raise ConfigurationError(f'waited {START_DEADLINE:g} s in vain for ' + ', '.join(
+                    f'{topic} ({publishers(topic)} publishers)'
+                    for topic in compared if not recorder.counts[topic]
+                ))  # fmt: skip
         words, values = NOISE
         begin, elapsed = time.monotonic(), 0.0
         marks: list[tuple[int, str]] = []

@@ -10,9 +10,9 @@ import signal
 import bag_files as files
 from commands import COMMAND, environment, ROOT, run, start, take_domain, wait_until
 from fhaosmo_ros.nodes.middleware.messages import message_class
+from fhaosmo_ros.tools import demo
 from fhaosmo_ros.tools.bags.reader import BagReader
 from fhaosmo_ros.tools.bags.recorded import read_ticks
-from fhaosmo_ros.tools.demo import observers, OTHERS
 from fhaosmo_ros.topics import ESTIMATES, EVENT, PARAMETERS, SNAPSHOT
 from mcap.reader import NonSeekingReader
 import numpy as np
@@ -192,19 +192,19 @@ def test_only_installed_message_types_have_a_class(tmp_path, monkeypatch):
     assert mark.exists()
 
 
-def expect_no_process(demo):
+def expect_no_process(process):
     """Expect that all processes of its session have ended."""
     with pytest.raises(ProcessLookupError):
-        os.killpg(demo.pid, 0)
+        os.killpg(process.pid, 0)
 
 
 def test_run_leaves_a_report_a_figure_and_a_bag_but_no_process(tmp_path):
     """With the second engine: what it has found is in the bag, and there is no power."""
     folder = tmp_path / 'out'
-    demo = start('demo', '--duration', 9, '--output', folder, '--self-tuning', **APART)
-    out, err = demo.communicate(timeout=400)
-    assert demo.returncode == 0, err
-    expect_no_process(demo)
+    process = start('demo', '--duration', 9, '--output', folder, '--self-tuning', **APART)
+    out, err = process.communicate(timeout=400)
+    assert process.returncode == 0, err
+    expect_no_process(process)
     for word in ('RMS error', 'z1', 'z2', 'z3', 'now with noise of 1e-4 on y'):
         assert word in out
     assert (folder / 'report.txt').read_text().strip() in out
@@ -212,7 +212,7 @@ def test_run_leaves_a_report_a_figure_and_a_bag_but_no_process(tmp_path):
         topics = {c.topic for c in reader.connections}
     found = [f'/estimator/{part}' for part in (*ESTIMATES, 'tuning', SNAPSHOT, PARAMETERS)]
     assert {'/y', '/plant/state', '/plant/unknown_input', *found} <= topics
-    (live,) = observers(folder / 'bag', {'gains': 'self_tuning'})
+    (live,) = demo.observers(folder / 'bag', {'gains': 'self_tuning'})
     assert len(live.stamps) > 300
     assert live.gamma is None
     late = live.stamps > live.stamps[0] + 3_000_000_000
@@ -233,9 +233,16 @@ def test_ctrl_c_ends_early_with_a_report_and_without_a_trace(tmp_path):
     assert process.returncode == 0, err
     assert 'Traceback' not in err
     assert 'stopped early' in out
-    assert all(name in out for name in OTHERS)
+    assert all(name in out for name in demo.OTHERS)
     assert (folder / 'demo.png').read_bytes()[:8] == b'\x89PNG\r\n\x1a\n'
     expect_no_process(process)
+
+
+def test_a_start_that_takes_too_long_says_what_is_missing(tmp_path, monkeypatch, capfd):
+    monkeypatch.setenv('ROS_DOMAIN_ID', APART['env']['ROS_DOMAIN_ID'])
+    monkeypatch.setattr(demo, 'START_DEADLINE', 0.0)
+    assert demo.main(['--output', str(tmp_path / 'out')]) == 2
+    assert 'waited 0 s in vain for /y (0 publishers), /plant/state' in capfd.readouterr().err
 
 
 def test_another_plant_in_the_same_domain_is_refused(live, tmp_path):
