@@ -146,13 +146,13 @@ def test_command_says_what_a_bag_shows_or_that_it_can_give_no_gains(tmp_path, ca
     r = Family(family | {'noise_std': 1e-3, 'dropout': 0.02}).recording(0)
     stamps = 10**18 + np.round(r.t * 1e9).astype(np.int64)
     bag, out = files.write(tmp_path / 'bag', files.floats(stamps, r.y)), tmp_path / 'out'
-    command = ['--bag', str(bag), '-o', str(out), '-p', 'input_topic:=/y']
+    command = ['--bag', str(bag), '-o', str(out), '-pinput_topic:=/y', '-pgains:=self_tuning']
     assert main([*command, '-p', 'noise_size:=1000.0']) == 2
     assert 'd = 0' in capsys.readouterr().err
     assert not out.exists()
     assert main(command) == 0
     values = load(out / 'gains.yaml', 'estimator')
-    OnlineEstimator(ESTIMATOR_PARAMETERS.complete(values))
+    assert not OnlineEstimator(ESTIMATOR_PARAMETERS.complete(values)).observer.self_tuning
     assert values['noise_size'] == pytest.approx(1e-3, rel=0.1)
     assert values['correction_period'] == pytest.approx(1.0 / 200.0, rel=1e-3)
     assert values['input_topic'] == '/y'

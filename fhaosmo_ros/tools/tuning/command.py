@@ -94,7 +94,11 @@ def _tune(arguments: argparse.Namespace, stop: Stop) -> None:
 
 
 def read_parameters(files: list[Path], rules: list[str]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return what files and rules set for the estimator, and for the tuning."""
+    """
+    Return what files and rules set for the estimator, and for the tuning.
+
+    The gains are fixed ones, also where those files have a self-tuning estimator.
+    """
     estimator: dict[str, Any] = {}
     tuning: dict[str, Any] = {}
     for path in files:
@@ -104,7 +108,7 @@ def read_parameters(files: list[Path], rules: list[str]) -> tuple[dict[str, Any]
         tuning |= ParameterTable(MODEL, SENSOR).part_of(found)
         tuning |= load(path, 'plant', TUNE_PARAMETERS) | load(path, 'tune', TUNE_PARAMETERS)
     given = BOTH.coerce(values_of(rules))
-    estimator |= ESTIMATOR_PARAMETERS.part_of(given)
+    estimator |= ESTIMATOR_PARAMETERS.part_of(given) | {'gains': 'fixed'}
     return estimator, tuning | TUNE_PARAMETERS.part_of(given)
 
 
