@@ -9,8 +9,8 @@ import os
 from pathlib import Path
 import re
 import shlex
-import shutil
 import sys
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from fhaosmo_ros import __version__
@@ -114,26 +114,32 @@ def output_at(final: Path, force: bool = False, *inputs: Path) -> Iterator[Path]
             raise ConfigurationError(
                 f'output {final}: expected another place than the input has, got that of {path}'
             )
-    empty = not final.exists() or (final.is_dir() and not any(final.iterdir()))
-    if not (empty or force):
-        raise ConfigurationError(
-            f'output {final}: expected a new name (or --force to replace it), got an existing '
-            f'{"folder with something in it" if final.is_dir() else "file"}'
-        )
-    folder = final.with_name(f'.{final.name}.part')
-    shutil.rmtree(folder, ignore_errors=True)  # of a run that was killed
-    folder.mkdir(parents=True)
-    try:
-        yield folder / final.name
-        if final.exists():
-            final.rename(folder / 'replaced')
-        (folder / final.name).rename(final)
-    except OSError as error:
-        if error.filename is None:  # of a write, such as to a disk that is full
-            raise OSError(error.errno, error.strerror, str(final)) from None
-        raise
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
+
+    def expect_free() -> None:
+        empty = not final.exists() or (final.is_dir() and not any(final.iterdir()))
+        if not (empty or force):
+            raise ConfigurationError(
+                f'output {final}: expected a new name (or --force to replace it), got an existing '
+                f'{"folder with something in it" if final.is_dir() else "file"}'
+            )
+
+    expect_free()
+    final.parent.mkdir(parents=True, exist_ok=True)
+    folder = TemporaryDirectory(
+        prefix=f'.{final.name}.', suffix='.part', dir=final.parent, ignore_cleanup_errors=True
+    )
+    with folder as name:
+        written = Path(name, final.name)
+        try:
+            yield written
+            expect_free()  # another process may have been quicker
+            if final.exists():
+                final.rename(Path(name, 'replaced'))
+            written.rename(final)
+        except OSError as error:
+            if error.filename is None:  # of a write, such as to a disk that is full
+                raise OSError(error.errno, error.strerror, str(final)) from None
+            raise
 
 
 def shipped(relative: str) -> Path:

@@ -158,7 +158,7 @@ def _replay(arguments: argparse.Namespace, stop: Stop) -> None:
         node = recorded.topic.rpartition('/')[0] if recorded else arguments.node
         namespace, model = node.rpartition('/')[0], estimator.observer.model
         inputs = BagInputs(reader, values, model, namespace, arguments.channel)
-        finals = arguments.output or [Path(f'{bag_name}_replayed')]
+        finals = [*dict.fromkeys(arguments.output or [Path(f'{bag_name}_replayed')])]
         outputs = [
             stack.enter_context(output_at(final, arguments.force, arguments.bag))
             for final in finals
