@@ -3,6 +3,7 @@
 
 import argparse
 from pathlib import Path
+import sys
 import time
 
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
@@ -32,8 +33,6 @@ def _play(arguments: argparse.Namespace, stop: Stop) -> None:
     with BagReader(arguments.bag) as reader:
         wanted = arguments.topics or [c.topic for c in reader.connections if c.msgcount]
         topics = {t: reader.message_type(t) for t in wanted if t not in NEVER_PLAYED}
-        if not topics:
-            raise ConfigurationError(f'bag {arguments.bag}: expected a message to play, got none')
         latched = {
             c.topic
             for c in reader.connections
@@ -45,7 +44,9 @@ def _play(arguments: argparse.Namespace, stop: Stop) -> None:
                 try:
                     publish[topic] = node.publisher(topic, kind, topic in latched)
                 except LookupError:
-                    print(f'play: not played: {topic}: {kind} is not installed here')
+                    print(f'play: not played: {topic}: {kind} is not installed', file=sys.stderr)
+            if not publish:
+                raise ConfigurationError(f'{arguments.bag}: expected a message to play, got none')
             print(f'playing {len(publish)} topics; Ctrl-C ends it', flush=True)
             stop.wait(DISCOVERY)
             now = ahead = 0
