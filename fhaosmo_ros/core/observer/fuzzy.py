@@ -174,13 +174,9 @@ def infer(x: Curve, system: FuzzySystem) -> Curve:
 def _centroid(y: Curve) -> Any:
     """Return the centroid of the region below a line through points over `UNIVERSE`."""
     begin, step, left, right = UNIVERSE[:-1], np.diff(UNIVERSE), y[:-1], y[1:]
-    with np.errstate(invalid='ignore'):  # 0 / 0 where the region has no height
-        middle = 2.0 / 3.0 * step * (right + 0.5 * left) / (left + right) + begin
-    cases = [left == right, left == 0.0, right == 0.0]
-    exact = [0.5 * (begin + UNIVERSE[1:]), 2.0 / 3.0 * step + begin, 1.0 / 3.0 * step + begin]
-    middle = np.select(cases, exact, middle)
-    area = np.where(left == right, step * left, 0.5 * step * (left + right))
-    return np.cumsum(middle * area)[-1] / np.cumsum(area)[-1]
+    areas = 0.5 * step * (left + right)
+    moments = begin * areas + step**2 * (left + 2.0 * right) / 6.0
+    return moments.sum() / areas.sum()
 
 
 @lru_cache(maxsize=32)
