@@ -90,10 +90,12 @@ def test_outliers_are_left_out_and_told(plain):
     assert along.counters.divergences == 0
 
 
-def test_given_values_stay():
+def test_given_values_stay_but_not_former_gains():
+    former = {'unknown_input_size': 9.9, 'correction_period': 1.0, 'fuzzy_widths': [5.0]}
     given = {'noise_size': 2e-3, 'unknown_input_derivatives': 0, 'unknown_input_decay': 1.5}
-    found, gains, _ = found_in(plant()[:, 0] + noise(), **given)
+    found, gains, _ = found_in(plant()[:, 0] + noise(), **given, **former)
     assert given.items() <= gains.items()
+    assert not any(gains[name] == value for name, value in former.items())
     assert (found.best.noise, found.best.design.decay) == pytest.approx((2e-3, 1.5))
 
 
@@ -150,11 +152,12 @@ def test_command_says_what_a_bag_shows_or_that_it_can_give_no_gains(tmp_path, ca
     assert main([*command, '-p', 'noise_size:=1000.0']) == 2
     assert 'd = 0' in capsys.readouterr().err
     assert not out.exists()
-    assert main(command) == 0
+    assert main([*command, '-plambda:=[1.0]']) == 0
     values = load(out / 'gains.yaml', 'estimator')
     assert not OnlineEstimator(ESTIMATOR_PARAMETERS.complete(values)).observer.self_tuning
     assert values['noise_size'] == pytest.approx(1e-3, rel=0.1)
     assert values['correction_period'] == pytest.approx(1.0 / 200.0, rel=1e-3)
     assert values['input_topic'] == '/y'
+    assert len(values['lambda']) > 1
     for text in ((out / 'report.md').read_text(), capsys.readouterr().out):
         assert '| expected error of d' in text

@@ -36,6 +36,7 @@ BOUNDS = np.log([[SLOWEST, QUICKEST], [1e-3, 30.0]])  # .. and bounds of these
 EVALUATIONS = 120
 DERIVATIVES = (0, 1, 2, 3)
 WORTH = 3.0  # by so much a richer model must raise the log-likelihood
+KEPT = 'noise_size', 'state_sizes', 'unknown_input_decay'  # exactly as the user set them
 CLIP = 3.0  # standard deviations from which on innovations count linearly (Huber 1964)
 SETTLED = 8.0  # time constants of the filter after which its covariance is steady
 LEAST_USED = 0.9  # part of the samples that needs a finite innovation
@@ -291,6 +292,7 @@ class Identification:
         states = best.estimates[begin:, :order]
         sizes = np.maximum(np.sqrt(np.nanmean(np.square(states), axis=0)), noise)
         values = {
+            **self._given,
             **SCHEME,
             'correction_period': period,
             'noise_size': noise,
@@ -300,7 +302,7 @@ class Identification:
             'unknown_input_decay': rounded(best.design.decay),
             'fuzzy_widths': [rounded(WIDTH * noise)],
             'gamma_initial': GAMMA,
-            **self._given,
+            **{name: self._given[name] for name in KEPT if self._given.get(name)},
         }
         checked = OBSERVER_PARAMETERS.complete(OBSERVER_PARAMETERS.part_of(values))
         values['lambda'], errors = kalman_gains(checked, period)

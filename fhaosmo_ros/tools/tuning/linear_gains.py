@@ -37,9 +37,7 @@ def chosen_otherwise(estimator: Mapping[str, Any]) -> list[str]:
     """Return the parameters, as set by the user, that ask for something else than `SCHEME`."""
     wanted = {**SCHEME, 'unknown_input': True}
     differ = ('structure', 'scheme', 'unknown_input')
-    found = [name for name in differ if estimator.get(name, wanted[name]) != wanted[name]]
-    fit_one_scheme = ('lambda', 'alpha', 'epsilon', 'initial_internal')
-    return found + [name for name in fit_one_scheme if name in estimator]
+    return [name for name in differ if estimator.get(name, wanted[name]) != wanted[name]]
 
 
 def kalman_gains(p: Mapping[str, Any], period: float) -> tuple[list[float], Floats]:

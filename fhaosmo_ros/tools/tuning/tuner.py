@@ -70,6 +70,8 @@ GRID: dict[str, Sequence[float]] = {
     'unknown_input_derivatives': DERIVATIVES,
     'unknown_input_decay': RATES,  # 1/s
 }
+GAINS = 'lambda', 'alpha', 'epsilon', 'initial_internal'
+"""Gains that the user sets are where a search of the gains themselves begins."""
 DECADES = 3.0  # powers of ten around its start to which a search in logarithms goes
 LOST_TIME, LOST_SAMPLES = 0.1, 20
 """
@@ -179,7 +181,7 @@ class Tuner:
         own = {name: tuning[name] for name in ('order', 'phi')} | dict(estimator)
         self._noise, self._fixed = 0.0, own
         fuzzy = own.get('variant', SCHEME['variant']).startswith('fuzzy')
-        kalman = fuzzy and not chosen_otherwise(own)
+        kalman = fuzzy and not chosen_otherwise(own) and own.keys().isdisjoint(GAINS)
         if kalman:
             self._fixed = self._kalman_start(own) | own
             free = {name: [own[name]] if name in own else grid for name, grid in GRID.items()}
