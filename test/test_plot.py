@@ -57,6 +57,13 @@ def test_truth_is_unknown_where_the_bag_lacks_it(bag, tmp_path, capsys):
     said = capsys.readouterr().out
     assert 'bag /estimator' in said
     assert 'nan' not in said
+    other = curves._replace(
+        names=['z1', 'd'], estimate=curves.estimate[:, ::3], truth=None, unit='rad'
+    )
+    plot.save_curves([other, curves], tmp_path / 'both.svg')
+    assert {'<!-- true -->', '<!-- input d [rad/s] -->'} <= set(
+        map(str.strip, (tmp_path / 'both.svg').read_text().splitlines())
+    )
 
 
 def test_table_says_the_errors_that_are_in_the_bag(bag):

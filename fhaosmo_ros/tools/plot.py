@@ -219,7 +219,8 @@ def save_curves(curves: list[Curves], path: Path, marks: Sequence[tuple[int, str
     """
     first, names = curves[0], max((c.names for c in curves), key=len)
     gamma = ['gamma'] if any(c.gamma is not None for c in curves) else []
-    error = ['error of d'] if any(c.truth is not None for c in curves) else []
+    known = next((c for c in curves if c.truth is not None), None)
+    error = ['error of d'] if known else []
     rows = [*names, *error, *gamma, 'innovation']
     figure = Figure(figsize=(8.5, 1.45 * len(rows) + 0.9), layout='constrained')
     axes = figure.subplot_mosaic([[row] for row in rows], sharex=True)
@@ -231,7 +232,7 @@ def save_curves(curves: list[Curves], path: Path, marks: Sequence[tuple[int, str
         t = (c.stamps - origin) * 1e-9
         for k, name in enumerate(c.names):
             row = axes[name]
-            if c.truth is not None and number == 0:
+            if c.truth is not None and c is known:
                 row.plot(*envelope(t, c.truth[:, k]), **TRUE_STYLE)
             row.plot(*envelope(t, c.estimate[:, k]), **style)
             if c.deviation is not None:
@@ -247,14 +248,14 @@ def save_curves(curves: list[Curves], path: Path, marks: Sequence[tuple[int, str
             axes['gamma'].set_ylabel('power γ')
     for name in names:
         those = [c for c in curves if name in c.names]
-        unit = derivative_unit(those[0].unit, names.index(name))
+        unit = derivative_unit(those[0].unit, those[0].names.index(name))
         axes[name].set_ylabel(titled('unknown\ninput d' if name == 'd' else name, unit))
         # What comes after the first tenth fills the picture.
         late = [c.estimate[len(c.stamps) // 10 :, c.names.index(name)] for c in those]
-        known = np.ma.masked_invalid(np.concatenate(late)).compressed()
-        if len(known):
-            margin = 0.1 * float(np.ptp(known)) or 0.1 * abs(float(known[0])) or 1.0
-            axes[name].set_ylim(known.min() - margin, known.max() + margin)
+        shown = np.ma.masked_invalid(np.concatenate(late)).compressed()
+        if len(shown):
+            margin = 0.1 * float(np.ptp(shown)) or 0.1 * abs(float(shown[0])) or 1.0
+            axes[name].set_ylim(shown.min() - margin, shown.max() + margin)
     t = (first.stamps - origin) * 1e-9
     _draw_innovations(axes['innovation'], t, first.innovation, first.epsilon)
     axes['innovation'].set_ylabel('|innovation|' + ('\n(first)' if len(curves) > 1 else ''))
