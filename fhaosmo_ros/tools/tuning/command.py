@@ -13,9 +13,11 @@ from fhaosmo_ros.core.model.triangular import TriangularModel
 from fhaosmo_ros.core.parameters.declaration import ParameterTable
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.files import dumps, load
+from fhaosmo_ros.core.parameters.per_channel import of_named_channel
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS, MODEL
 from fhaosmo_ros.core.simulation.metrics import rms
 from fhaosmo_ros.core.simulation.recordings import SENSOR
+from fhaosmo_ros.inputs import with_joints
 from fhaosmo_ros.stop_signals import Stop
 from fhaosmo_ros.tools.bags.reader import BagReader
 from fhaosmo_ros.tools.bags.recorded import BagInputs
@@ -53,6 +55,7 @@ def main(argv: list[str] | None = None) -> int:
         '--bag', type=Path,
         help='find the gains that are likeliest for its y (of input_topic, input_field)',
     )  # fmt: skip
+    add('--channel', default='', metavar='NAME', help="whose y: of this one of a node's channels")
     add = parser.add_argument_group('from simulated recordings').add_argument
     add(
         '--trials', type=int, default=1000, metavar='N',
@@ -79,7 +82,7 @@ def _tune(arguments: argparse.Namespace, stop: Stop) -> None:
     with output_at(arguments.output, arguments.force, *inputs) as folder:
         if arguments.bag:
             with stop.raising():
-                parameters, text = _of_bag(arguments.bag, estimator, tuning)
+                parameters, text = _of_bag(arguments.bag, arguments.channel, estimator, tuning)
         else:
             parameters, text = _of_search(arguments, estimator, tuning, stop)
         folder.mkdir()
@@ -140,8 +143,14 @@ def _of_search(
     return tuned, f'{text}\n\n{markdown(columns, rows)}'
 
 
-def _of_bag(path: Path, estimator: dict[str, Any], tuning: dict[str, Any]) -> Found:
+def _of_bag(path: Path, channel: str, estimator: dict[str, Any], tuning: dict[str, Any]) -> Found:
     """Find the gains for what the y of a bag shows."""
+    values = with_joints(estimator)
+    own = of_named_channel(values, channel, '--channel')
+    given = {name.removeprefix(f'{channel}.') for name in values}
+    estimator = {name: value for name, value in own.items() if name in given}
+    if channel:
+        estimator['channels'] = [channel]
     if others := chosen_otherwise(estimator):
         raise ConfigurationError(
             f'--bag: expected gains of structure levant, got {", ".join(others)} set. Leave that '
@@ -152,7 +161,7 @@ def _of_bag(path: Path, estimator: dict[str, Any], tuning: dict[str, Any]) -> Fo
     values = ESTIMATOR_PARAMETERS.complete(given)
     given |= {name: values[name] for name in ('order', 'phi')}
     with BagReader(path) as reader:
-        inputs = BagInputs(reader, values, TriangularModel.of(values))
+        inputs = BagInputs(reader, values, TriangularModel.of(values), channel=channel)
         samples, field = inputs.samples()
         if field.wraps:
             samples = samples.unwrapped()
