@@ -12,6 +12,7 @@ cdef void carry(int n, const Row* f, Row* p) noexcept nogil
 cdef void multiply(int n, const Row* f, Row* p) noexcept nogil
 cdef void add_drive(int last, double intensity, double h, Row* p) noexcept nogil
 cdef void correct(int n, Row* p, double variance) noexcept nogil
+cdef double usual(int i, int j, double rate, double intensity) noexcept nogil
 
 
 cdef class LinearModel:

@@ -6,7 +6,7 @@ For the scheduled gains, the smoother and the identification of a recording. The
 observer has the same formulas with one more index (self_tuning/members.pyx).
 """
 
-from libc.math cimport NAN, ceil, sqrt
+from libc.math cimport NAN, ceil, pow, sqrt
 from libc.string cimport memcpy, memset
 
 from fhaosmo_ros.core.model.prediction cimport MOST_LEVELS, Prediction
@@ -156,10 +156,23 @@ cdef class LinearModel:
         return np.linalg.matrix_power(part, count), np.array(q)[:n, :n].copy()
 
 
+cdef double usual(int i, int j, double rate, double intensity) noexcept nogil:
+    """Return the covariance of the levels i and j before the last one, as ever in D 17."""
+    cdef int m
+    for m in range(1, i + 1):  # (i + j)! / (i! j!)
+        intensity *= (j + m) / <double>m
+    return intensity / pow(2.0 * rate, i + j + 1)
+
+
+def stationary(rate, derivatives, intensity):
+    """Return the covariance of d and its derivatives, (k + 1, k + 1), as ever in D 17."""
+    before = range(derivatives, -1, -1)
+    return np.array([[usual(i, j, rate, intensity) for j in before] for i in before])
+
+
 def matern(rate, derivatives):
     """Return the intensity of the white noise behind a Matern d of the RMS 1 (D 17)."""
-    k = derivatives
-    return (2.0 * rate) ** (2 * k + 1) * math.factorial(k) ** 2 / math.factorial(2 * k)
+    return 1.0 / usual(derivatives, derivatives, rate, 1.0)
 
 
 class Uncertainty:
@@ -200,8 +213,7 @@ class Uncertainty:
         self.fresh[range(n), range(n)] = np.square(STATES_DOUBT * sizes)
         if p['start_from_measurement']:
             self.fresh[0, 0] = self.variance
-        chain = np.eye(k + 1, k=1) - rate * np.eye(k + 1)
-        self.fresh[n:, n:] = INPUT_DOUBT**2 * stationary(chain, self.linear.intensity)
+        self.fresh[n:, n:] = INPUT_DOUBT**2 * stationary(rate, k, self.linear.intensity)
 
     def steady(self, period):
         """
@@ -237,14 +249,6 @@ class Uncertainty:
                 f'got a noise of {noise:g} and an intensity of {self.linear.intensity:g}'
             )
         return steady
-
-
-def stationary(chain, intensity):
-    """Return the covariance of a chain whose last state is driven by white noise."""
-    size, eye = len(chain), np.eye(len(chain))
-    drive = np.append(np.zeros(size**2 - 1), -intensity)
-    whole = np.kron(chain, eye) + np.kron(eye, chain)
-    return np.linalg.solve(whole, drive).reshape(size, size)
 
 
 def innovations(Prediction prediction not None, samples, linear):

@@ -10,12 +10,12 @@ its likeliest member at each sample. Its estimates stand where numbers overflow.
 Rauch, Tung and Striebel 1965, doi:10.2514/3.3166; Bierman 1973, Int. J. Control 18 (1).
 """
 
-from libc.math cimport INFINITY, exp, fabs, isfinite, pow, sqrt
+from libc.math cimport INFINITY, exp, fabs, isfinite, sqrt
 from libc.string cimport memcpy, memset
 
 from fhaosmo_ros.core.model.prediction cimport MOST_LEVELS, Prediction
 from fhaosmo_ros.core.observer.kalman cimport (
-    Row, add_drive, carry, correct, multiply, sub_steps
+    Row, add_drive, carry, correct, multiply, sub_steps, usual
 )
 from fhaosmo_ros.core.observer.self_tuning.members cimport by_binomials, ORDERS
 from fhaosmo_ros.core.observer.self_tuning.weights cimport Model
@@ -173,7 +173,9 @@ cdef class Passes:
                 now.p[i][i] = now.own[1][i]
         for i in range(chain + 1):
             for j in range(chain + 1):
-                now.p[d + i][d + j] = usual(now, chain - i, chain - j)
+                now.p[d + i][d + j] = usual(
+                    chain - i, chain - j, now.model.loss, now.model.drive
+                )
 
     cdef void predict(self, const Point* before, Point* now) noexcept nogil:
         """Predict a row from the one before (D 24); if that can't be, begin at the observer's."""
@@ -245,7 +247,8 @@ cdef class Passes:
             memset(now.f[i], 0, sizeof(Row))
         carry(self.n, now.f, now.p)
         for i in range(before.last + 1, now.last + 1):
-            now.p[i][i] = max(now.p[i][i], usual(now, now.last - i, now.last - i))
+            j = now.last - i
+            now.p[i][i] = max(now.p[i][i], usual(j, j, now.model.loss, now.model.drive))
         for i in range(d + 1):
             if SURER * now.p[i][i] < now.own[1][i] < INFINITY:
                 now.p[i][i] = now.own[1][i]
@@ -378,12 +381,3 @@ cdef class Passes:
         change, allowed = np.abs(np.asarray(out)[:, 0] - x), TOLERANCE * np.sqrt(np.abs(p))
         is_open = (change > allowed + ROUNDING * np.abs(x)).any(axis=1)
         return np.argmax(np.append(is_open, True))
-
-
-cdef double usual(const Point* now, int i, int j) noexcept nogil:
-    """Return the covariance of the levels i and j before the last one, as ever in D 26."""
-    cdef double share = now.model.drive
-    cdef int m
-    for m in range(1, i + 1):  # (i + j)! / (i! j!)
-        share *= (j + m) / <double>m
-    return share / pow(2.0 * now.model.loss, i + j + 1)

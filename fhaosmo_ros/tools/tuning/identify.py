@@ -181,7 +181,7 @@ class Identification:
         a, added = LinearModel(rates, q).transition(self.period)
         fresh = np.zeros((size, size))
         fresh[range(1, n), range(1, n)] = np.square(self._sizes[1:])
-        fresh[n:, n:] = stationary(rates[n:, n:], q)
+        fresh[n:, n:] = stationary(design.decay, design.derivatives, q)
         fresh[0, 0] = noise  # the filter begins with z_1 = y
         settled = int(min(SETTLED / (design.bandwidth * self.period), 2.0**40))
         return SimpleNamespace(
