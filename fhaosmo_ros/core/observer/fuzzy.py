@@ -167,16 +167,11 @@ def infer(x: Curve, system: FuzzySystem) -> Curve:
         peaks = np.array(system.outputs.peaks)[rules]
         return np.asarray(peaks @ activations / activations.sum(axis=0))
     outputs = memberships(UNIVERSE, system.outputs)[rules]
-    regions = (np.minimum(a[:, None], outputs).max(axis=0) for a in activations.T)
-    return np.array([_centroid(region) for region in regions])
-
-
-def _centroid(y: Curve) -> Any:
-    """Return the centroid of the region below a line through points over `UNIVERSE`."""
-    begin, step, left, right = UNIVERSE[:-1], np.diff(UNIVERSE), y[:-1], y[1:]
-    areas = 0.5 * step * (left + right)
+    y = np.array([np.minimum(a[:, None], outputs).max(axis=0) for a in activations.T])
+    begin, step, left, right = UNIVERSE[:-1], np.diff(UNIVERSE), y[:, :-1], y[:, 1:]
+    areas = 0.5 * step * (left + right)  # below the line through the points
     moments = begin * areas + step**2 * (left + 2.0 * right) / 6.0
-    return moments.sum() / areas.sum()
+    return np.asarray(moments.sum(axis=1) / areas.sum(axis=1))
 
 
 @lru_cache(maxsize=32)
