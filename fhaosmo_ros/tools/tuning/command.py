@@ -192,7 +192,7 @@ def notes(found: Identification, correlation: float, probability: float) -> Iter
     if found.quantum > 2.0 * found.best.noise:
         yield (
             f'y comes in steps of {found.quantum:.3g}, larger than its noise: the '
-            'error of the steps is not random. docs/recipes.md says what helps.'
+            'error of the steps is not random. `gains: self_tuning` knows of steps.'
         )
     if found.outliers:
         yield (

@@ -218,7 +218,7 @@ class Tuner:
             width = max(sizes[1] * self._period, least)
         elif min(sizes) > 0.0:
             found |= {'noise_size': noise, 'state_sizes': sizes[:-1]}
-        return found | {'fuzzy_widths': [WIDTH * width]}
+        return found | {'fuzzy_widths': [rounded(WIDTH * width)]}
 
     def parameters(self, values: Values) -> dict[str, Any]:
         """
