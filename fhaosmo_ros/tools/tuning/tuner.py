@@ -73,12 +73,6 @@ GRID: dict[str, Sequence[float]] = {
 GAINS = 'lambda', 'alpha', 'epsilon', 'initial_internal'
 """Gains that the user sets are where a search of the gains themselves begins."""
 DECADES = 3.0  # powers of ten around its start to which a search in logarithms goes
-LOST_TIME, LOST_SAMPLES = 0.1, 20
-"""
-Seconds, and at least so many samples, for which the innovation exceeds the largest half-width
-before the estimator restarts. With all levels saturated the chain of integrators may oscillate
-without end.
-"""
 
 
 def simulated(values: Parameters, seed: int) -> tuple[list[Recording], list[Recording]]:
@@ -236,8 +230,7 @@ class Tuner:
             if not p['noise_size']:  # nothing says how sure the observer is
                 found.pop('unknown_input_size')
         if p['structure'] == 'levant' and p['variant'].startswith('fuzzy') and not p['noise_size']:
-            lost = rounded(max(LOST_TIME, LOST_SAMPLES * self._period))
-            found = {'epsilon': max(p['fuzzy_widths']), 'divergence_time': lost} | found
+            found = {'epsilon': max(p['fuzzy_widths'])} | found  # for `divergence_time`
         # The gains fit these only, so a file has them even where they are the defaults.
         return found | {name: p[name] for name in ('variant', 'scheme', 'unknown_input')}
 
