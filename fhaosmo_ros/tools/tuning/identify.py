@@ -14,7 +14,6 @@ from fhaosmo_ros.core.online.policy import GAP_SAMPLES
 from fhaosmo_ros.core.parameters.declaration import Parameters
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.tables import OBSERVER_PARAMETERS
-from fhaosmo_ros.core.simulation.metrics import rms
 from fhaosmo_ros.tools.cli.command import progress
 from fhaosmo_ros.tools.tuning.linear_gains import GAMMA, kalman_gains, rounded, SCHEME, WIDTH
 import numpy as np
@@ -30,6 +29,7 @@ FEWEST = 500  # samples
 FEWEST_STEPS = 20  # changes of y that say a quantum
 ON_GRID = 0.02  # how close values on a grid are to multiples of the quantum, relatively
 SLOWEST, QUICKEST = 1e-5, 3.0  # bandwidths of the filters (rad a sample)
+MOTIONS = 300.0  # rate of z over that of the whole recording, at most
 FIRST = np.geomspace(2e-4, 2.0, 15)  # at the likeliest of these the search begins
 STEPS = np.array([0.3, 0.5])  # sides of the first simplex in ln bandwidth and ln ratio ..
 BOUNDS = np.log([[SLOWEST, QUICKEST], [1e-3, 30.0]])  # .. and bounds of these
@@ -114,14 +114,8 @@ class Identification:
         used = np.ones(count, dtype=bool)
         self.samples = Samples(h, periods, y, np.ascontiguousarray(u), used)
         self._longest = values['prediction_step'] or usual_step(model)
-        # How far off z_1 .. z_n may be where the filter begins: a first guess.
-        block = max(count // 300, 1)
-        slow = y[: count // block * block].reshape(-1, block).mean(axis=1)
-        sizes = [rms(slow)]
-        for _ in range(1, model.order):
-            slow = np.diff(slow) / (block * period)
-            sizes.append(3.0 * rms(slow))
-        self._sizes = np.array(sizes)
+        # How far off z_1 .. z_n may be where the filter begins: a first guess, rather too much.
+        self._sizes = np.std(y) * (MOTIONS / (t[-1] - t[0])) ** np.arange(model.order)
         # The noise: a smooth signal vanishes in differences of high order.
         self.quantum = quantum(y)  # 0 for none that shows
         self._rounding = self.quantum / math.sqrt(12.0)
