@@ -148,12 +148,12 @@ def test_command_says_what_a_bag_shows_or_that_it_can_give_no_gains(tmp_path, ca
     r = Family(family | {'noise_std': 1e-3, 'dropout': 0.02}).recording(0)
     stamps = 10**18 + np.round(r.t * 1e9).astype(np.int64)
     bag, out = files.write(tmp_path / 'bag', files.floats(stamps, r.y)), tmp_path / 'out'
-    (tmp_path / 'p.yaml').write_text(
+    path = tmp_path / 'p.yaml'
+    path.write_text(
         '/**: {ros__parameters: {channels: [hip, elbow], input_topic: /y, gains: self_tuning, '
         "hip.lambda: [1.0], elbow.phi: ['0', '0', '0']}}"
     )
-    command = ['--bag', str(bag), '-o', str(out), '--params-file', str(tmp_path / 'p.yaml')]
-    command.append('--channel=hip')
+    command = [f'--bag={bag}', f'-o{out}', f'--params-file={path}', '--channel=hip']
     assert main([*command, '-p', 'noise_size:=1000.0']) == 2
     assert 'd = 0' in capsys.readouterr().err
     assert not out.exists()
@@ -162,7 +162,6 @@ def test_command_says_what_a_bag_shows_or_that_it_can_give_no_gains(tmp_path, ca
     assert not OnlineEstimator(ESTIMATOR_PARAMETERS.complete(values)).observer.self_tuning
     assert values['noise_size'] == pytest.approx(1e-3, rel=0.1)
     assert values['correction_period'] == pytest.approx(1.0 / 200.0, rel=1e-3)
-    assert (values['input_topic'], values['channels']) == ('/y', ['hip'])
-    assert len(values['lambda']) > 1
+    assert (values['channels'], len(values['lambda']) > 1) == (['hip'], True)
     for text in ((out / 'report.md').read_text(), capsys.readouterr().out):
         assert '| expected error of d' in text
