@@ -198,7 +198,9 @@ def test_samples_that_nearly_coincide_are_no_jump_and_do_no_harm(free, number, a
     (lambda tau, g, load: 0 * g, {'effort': 'gravity_compensated'}, 'all efforts are zero'),
     (lambda tau, g, load: tau, {'effort': 'gravity_compensated'}, 'effort to torque'),
     (lambda tau, g, load: tau, {'gravity': [0.0, 0.0, -9.8]}, 'as if it were [4.0, 5.0, -7.4]'),
-    (lambda tau, g, load: tau + load, {}, 'parameter payload to [1.'),
+    (lambda tau, g, load: tau, {'gravity': [0.0] * 3}, 'as if it were [4.0, 5.0, -7.4]'),
+    (lambda tau, g, load: tau + load, {'payload': [0.5, 0.0, 0.0, 0.4]}, 'payload to [1.'),
+    (lambda tau, g, load: tau, {'payload': [1.5, 0.0, 0.0, 0.4]}, 'payload to [0, 0, 0, 0]'),
 ])  # fmt: skip
 def test_a_setting_that_is_wrong_is_said(wrong, options, text):
     """On a base that is not level, so that a payload is seen whole."""
@@ -212,6 +214,22 @@ def test_a_setting_that_is_wrong_is_said(wrong, options, text):
     found = arm.run(t, q, wrong(torque, g, load))
     assert text in arm.doubts.text
     assert np.isfinite(found.external_torque[-1]).all() == ('payload' in text)  # no mistake
+    arm.adopt(arm.parameters | {'payload': payload[::-1]})
+    assert not arm.doubts.text
+
+
+def test_efforts_of_zero_are_no_torque_of_an_arm_that_rests():
+    arm, rest = Arm(URDF), np.ones((1500, 3))
+    assert np.isnan(arm.run(4e-3 * np.arange(1500), rest, 0.0 * rest).external_torque[-1]).all()
+    assert arm.doubts.text == 'all efforts are zero: does the driver measure them?'
+
+
+def test_a_contact_does_not_flicker_where_false_alarms_are_allowed(free):
+    arm = Arm(URDF, false_alarms_per_minute=60.0)
+    found = run(arm, free, push=np.sin(free[0])[:, np.newaxis])
+    ends = np.flatnonzero(found.contact[:-1] & ~found.contact[1:]) + 1
+    assert len(ends)
+    assert np.all(found.log_odds[ends] <= arm._threshold)
 
 
 def test_a_wrench_is_found_at_a_frame_and_what_cannot_be_seen_is_said(free):

@@ -115,7 +115,7 @@ class Arm:
             text = f'calibration: expected the joints {own} in this order, got {got}'
             raise ConfigurationError(text)
         model.set_inertial(known.inertial, known.motor_inertia)
-        self.adopt(p)
+        model.set_payload(payload_of(p))
         self._of_position = p['measurement'] == 'position'
         self._with_gravity = p['effort'] != 'gravity_compensated'
         self._delay = p['torque_delay']
@@ -127,6 +127,7 @@ class Arm:
         found = np.array([known.torque_noise, known.position_noise, known.model_error])
         of_torque, of_position, error = np.where(found > 0.0, found, usual)
         self._model_variance = error**2
+        self.doubts = Doubts(model, self._with_gravity, error)
         # Of efforts, positions and velocities: at first, and at least.
         noise = np.array([of_torque, of_position, self._values('velocity_noise')])
         least = noise * [[LEAST_FOUND], [1.0], [1.0]]
@@ -148,6 +149,7 @@ class Arm:
         self.counters: Counter[str] = Counter()
         self.problem = ''
         self.reset()
+        self.adopt(p)
 
     def _values(self, name: str) -> Floats:
         """Return a parameter that has one value, or one for each joint."""
@@ -171,12 +173,15 @@ class Arm:
         self._contact = False
         self._looked, self._evidence = 0, self._rest  # stamp, and log-likelihood of each link
         self._reach = np.zeros((len(self._rest), len(self._rest)))
-        self.doubts = Doubts(self.model, self._with_gravity, np.sqrt(self._model_variance))
+        self.doubts.reset()
 
     def adopt(self, parameters: Parameters) -> None:
         """Go on with other live parameters; raise ConfigurationError for a bad payload."""
+        payload = payload_of(parameters)
         with self._alone:
-            self.model.set_payload(payload_of(parameters))
+            if payload != self.parameters['payload']:
+                self.model.set_payload(payload)
+                self.doubts.reset()
         self.parameters = ARM_PARAMETERS.complete(parameters)
         rare = np.log(parameters['false_alarms_per_minute'])
         self._threshold = (self.calibration.log_odds or ODDS) - rare
@@ -264,14 +269,14 @@ class Arm:
             bank.start(mass, drive, mass @ known, spread, self._model_variance)
         change = way if self._of_position else velocity
         bank.step(h, mass, change, vague, drive, self._reach)
-        self.doubts.take(h, q, torque, self._external)
-        if self.doubts.text and not self.doubts.payload:
-            self.problem = 'doubted'
-            return None
         self._velocity = self.model.velocity_of(self._momentum)
         if not samples.is_possible(2, self._velocity):  # C^T qd grows with its square
             samples.reset()
             self.problem = 'diverged'
+            return None
+        self.doubts.take(h, q, torque, self._external)
+        if self.doubts.text and not self.doubts.payload:
+            self.problem = 'doubted'
             return None
         return self._estimate(stamp, q, self._velocity)
 
@@ -279,7 +284,7 @@ class Arm:
         """Return what the bank says, and the likeliest link by all that it said in a contact."""
         bank, touched = self._bank, self._contact
         odds, torques, covariance = bank.log_odds, self._external.copy(), bank.covariance.copy()
-        self._contact = odds > (0.0 if touched else self._threshold)
+        self._contact = odds > (min(0.0, self._threshold) if touched else self._threshold)
         every = LOOK_CLOSELY if self._contact else LOOK
         if self._contact != touched or stamp - self._looked >= every * 1e9:
             self._looked = stamp

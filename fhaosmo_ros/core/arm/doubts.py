@@ -7,7 +7,7 @@ One regression, with slow forgetting, of the external torque on what each mistak
 
 from typing import Any
 
-from fhaosmo_ros.core.arm.model import ArmModel, Floats
+from fhaosmo_ros.core.arm.model import ArmModel, Floats, USUAL
 import numpy as np
 
 EVERY = 0.1  # s between two rows
@@ -16,6 +16,7 @@ LEAST = 5.0  # s of motion that are looked at before anything is said
 EXPLAINED = 0.9  # share of the squared torque that a mistake has to explain
 LARGE = 4.0  # times the model's error from which on a torque is worth explaining
 MOVED = 0.1  # rad (m), standard deviation of a posture in which a push may look like anything
+PUT_DOWN = 0.1  # share of the payload below which nothing is carried
 # Least shares of the excitation at which a direction of gravity, and a payload, can be told.
 SEEN = 1e-3, 1e-5
 
@@ -30,6 +31,10 @@ class Doubts:
 
     def __init__(self, model: ArmModel, with_gravity: bool, error: Floats) -> None:
         self._model, self._with_gravity, self._error = model, with_gravity, error
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin anew, as for another payload."""
         self._time = 0.0
         self._sums: list[Any] = [0.0] * 6
         self.text, self.payload = '', False
@@ -55,9 +60,10 @@ class Doubts:
         count, mean, square, squares, normal, seen = self._sums
         own = np.diag(normal)[7:]  # of efforts
         moved = np.max(square / count - (mean / count) ** 2) > MOVED**2
-        if moved and not own.any():
+        large = np.mean(squares) > LARGE**2 * count
+        if (moved or large) and not own.any():
             return 'all efforts are zero: does the driver measure them?'
-        if not moved or np.mean(squares) < LARGE**2 * count:
+        if not (moved and large):
             return ''
 
         def fit(part: slice, least: float) -> Floats | None:
@@ -71,16 +77,16 @@ class Doubts:
         change = fit(slice(0, 3), SEEN[0])
         if change is not None:
             known = self._model.gravity
-            gravity = self._with_gravity * known - change
-            size = np.linalg.norm(gravity) / np.linalg.norm(known)
-            cosine = gravity @ known / (size * (known @ known))
-            if size < 0.3:
+            gravity, usual = self._with_gravity * known - change, np.linalg.norm(known) or USUAL
+            size = np.linalg.norm(gravity) / usual
+            cosine = gravity @ known / (size * usual**2)
+            if not self._with_gravity and size > 0.7:
+                return 'effort has gravity in it: set the parameter effort to torque'
+            if self._with_gravity and size < 0.3:
                 return (
                     'effort has hardly any gravity in it: set the parameter effort to '
                     'gravity_compensated, or to current'
                 )
-            if not self._with_gravity:
-                return 'effort has gravity in it: set the parameter effort to torque'
             if cosine < -0.9:
                 return 'the efforts of all joints have the wrong sign'
             if cosine < 0.98 and 0.7 < size < 1.4:
@@ -92,12 +98,19 @@ class Doubts:
         if wrong.any():
             names = ', '.join(np.array(self._model.joints)[wrong])
             return f'the effort of {names} has the wrong sign'
-        payload = fit(slice(3, 7), SEEN[1])
-        if payload is None or payload[0] <= 0.0:
+        more = fit(slice(3, 7), SEEN[1])
+        if more is None:
+            return ''
+        known = (self._model.inertial - self._model.unloaded)[-1, :4] * self._with_gravity
+        mass, *moments = known + more
+        if mass < PUT_DOWN * known[0]:
+            mass, moments = 0.0, [0.0] * 3
+        if mass <= known[0] == 0.0:
             return ''
         self.payload = True
-        numbers = ', '.join(f'{x:.3g}' for x in (payload[0], *(payload[1:] / payload[0])))
+        numbers = ', '.join(f'{x:.3g}' for x in (mass, *(x / (mass or 1.0) for x in moments)))
+        told = '' if self._with_gravity else ', and tell the controller, which compensates gravity'
         return (
-            f'the external torque is that of {payload[0]:.3g} kg more at the last link: if it '
-            f'carries something, set the parameter payload to [{numbers}]'
+            'the external torque is that of another payload: if the last link carries it, set the '
+            f'parameter payload to [{numbers}]{told}'
         )

@@ -25,6 +25,7 @@ Floats = NDArray[np.float64]
 GRIPPER = 'finger', 'gripper', 'knuckle'
 """Joints with such a word in their name are left out if none are named."""
 WIDTHS = 0.01, 0.03, 0.1, 0.3  # rad/s: how fast friction changes its sign, tanh(velocity / width)
+USUAL = 9.81  # m/s^2, of gravity: how heavy an arm is, also where there is none
 POSTURES = 200  # random ones over which the torque of the arm's weight is averaged
 
 
@@ -225,7 +226,7 @@ class ArmModel:
         large torques of this arm are, whatever its joints' axes.
         """
         random = np.random.default_rng(0)
-        weight = self.inertial[:, 0] * np.linalg.norm(self.gravity)
+        weight = self.inertial[:, 0] * USUAL
         postures = random.uniform(-np.pi, np.pi, (POSTURES, len(weight)))
         reaches = np.array([self.reach_of_links(q) for q in postures])
         squares = np.einsum('l,pljj->pj', weight**2, reaches) / 3.0
@@ -234,7 +235,7 @@ class ArmModel:
     @property
     def weight(self) -> float:
         """Of all that moves, N."""
-        return float(np.sum(self.inertial[:, 0]) * np.linalg.norm(self.gravity))
+        return float(np.sum(self.inertial[:, 0]) * USUAL)
 
 
 @dataclass(frozen=True)
