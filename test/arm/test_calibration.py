@@ -60,6 +60,13 @@ def test_noise_is_found_and_stays_finite_for_a_quantised_encoder(found):
     assert 0.5 < noise_of(rounded)[0] / (1e-4 / np.sqrt(12.0)) < 2.0
 
 
+def test_a_pause_and_a_clock_that_is_set_are_no_motion(found):
+    t, q, torque = recorded()
+    kept = (t < 13.0) | (t > 20.0)
+    paused = identify(ArmModel(URDF), *(x[kept] for x in (t + 1.7e9 * (t > 30.0), q, torque)))
+    assert np.all(paused.after < 1.5 * found.after)
+
+
 def test_links_that_cannot_exist_are_not_found():
     pseudo_inertia = pytest.importorskip('pinocchio').PseudoInertia.FromDynamicParameters
     model = ArmModel(URDF)
@@ -124,6 +131,9 @@ def test_commands_calibrate_find_a_payload_and_replay_a_bag(tmp_path, capsys):
     file, table = tmp_path / 'three.yaml', tmp_path / 'torque.csv'
     assert calibrate.main(['--bag', str(bag), '-o', str(file)]) == 0
     held_out = capsys.readouterr().out
+    wrong = ['-p', 'effort:=current', '-p', 'torque_constants:=[-1.0]']
+    assert calibrate.main(['--bag', str(bag), '-o', str(file), *wrong]) == 2
+    assert 'by the URDF alone, the efforts of all joints' in capsys.readouterr().err
     known = ['-p', f'calibration_file:={file}']
     assert calibrate.main(['--bag', str(bag), '--payload', *known]) == 0
     left = [

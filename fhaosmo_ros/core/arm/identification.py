@@ -27,6 +27,7 @@ DRAWS = tuple(10.0**k for k in range(-4, 3))
 HUBER, ROUNDS = 2.0, 6
 SHARE = 0.3  # standard deviation of URDFs' masses and inertias, as a share of them
 LEAST_ROWS, SHORTEST = 200, 10.0  # samples, and seconds, of the shortest recording
+GAP = 0.2  # s without a sample, after which filters begin anew
 LEVER = 0.1  # m: how far a link's centre may lie from where the URDF has it
 FARTHEST = 2.0  # m: how far the centre of a payload may lie from the last joint, each way
 # Of the search for links that can exist; their least pseudo-inertia, as a share.
@@ -143,38 +144,50 @@ class _Regression:
         self, model: ArmModel, t: Floats, q: Floats, effort: Floats, known: Calibration,
         torque_constants: ArrayLike,
     ) -> None:  # fmt: skip
-        n = len(model.joints)
-        if len(t) < LEAST_ROWS or not np.all(np.diff(t) > 0.0) or t[-1] - t[0] < SHORTEST:
+        n, steps = len(model.joints), np.diff(t)
+        parts = [
+            part for part in np.split(np.arange(len(t)), np.flatnonzero(steps > GAP) + 1)
+            if len(part) and np.ptp(t[part]) > BLOCK
+        ]  # fmt: skip
+        seconds = sum(np.ptp(t[part]) for part in parts)
+        if len(t) < LEAST_ROWS or not np.all(steps > 0.0) or seconds < SHORTEST:
             raise ConfigurationError(
                 f'recording: expected at least {SHORTEST:g} s of samples with increasing times, '
-                f'got {len(t)} samples'
+                f'in parts of {BLOCK:g} s without gaps, got {seconds:.3g} s in {len(t)} samples'
             )
         self._model = model
-        period = float(np.median(np.diff(t)))
-        even = np.arange(t[0], t[-1], period)
+        period = float(np.median(steps))
+        edge, every = int(0.5 / period), max(1, round(1.0 / (ROWS * period)))
 
         def low(array: Floats, cutoff: float) -> Floats:
             sos = butter(2, min(cutoff * period * 2.0, 0.5), output='sos')
             return np.asarray(sosfiltfilt(sos, array, axis=0))
 
-        raw, effort = (
-            np.column_stack([np.interp(even, t, column) for column in array.T])
-            for array in (np.where(model.continuous, np.unwrap(q, axis=0), q), effort)
-        )
-        quick = np.gradient(low(raw, QUICK), period, axis=0)
-        rubbing = [low(np.tanh(quick / width), CUTOFF) for width in WIDTHS]
-        smooth = low(raw, CUTOFF)
-        velocity = np.gradient(smooth, period, axis=0)
-        acceleration = np.gradient(velocity, period, axis=0)
-        edge, every = int(0.5 / period), max(1, round(1.0 / (ROWS * period)))
-        kept = slice(edge, len(even) - edge, every)
-        if not np.any(np.abs(velocity) > STILL):
+        def filtered(part: NDArray[np.intp]) -> tuple[Floats, Floats]:
+            even = np.arange(t[part[0]], t[part[-1]], period)
+            turned = np.where(model.continuous, np.unwrap(q[part], axis=0), q[part])
+            raw, torque = (
+                np.column_stack([np.interp(even, t[part], column) for column in array.T])
+                for array in (turned, effort[part])
+            )
+            quick = np.gradient(low(raw, QUICK), period, axis=0)
+            rubbing = [low(np.tanh(quick / width), CUTOFF) for width in WIDTHS]
+            smooth = low(raw, CUTOFF)
+            velocity = np.gradient(smooth, period, axis=0)
+            acceleration = np.gradient(velocity, period, axis=0)
+            kept, one = slice(edge, len(even) - edge, every), np.ones_like(velocity)
+            rows = smooth, low(torque, CUTOFF), acceleration, one, velocity, *rubbing
+            return even[kept], np.array(rows)[:, kept]
+
+        times, signals = zip(*map(filtered, parts), strict=True)
+        self.t = np.concatenate(times)
+        both = np.concatenate(signals, axis=1)
+        smooth, effort, own = both[0], both[1], both[2:]
+        acceleration, _, self.velocity = own[:3]
+        if not np.any(np.abs(self.velocity) > STILL):
             raise ConfigurationError(
                 f'recording: expected joints that move, got none faster than {STILL:g} rad/s'
             )
-        self.t, smooth, effort = even[kept], smooth[kept], low(effort, CUTOFF)[kept]
-        own = np.array([acceleration, np.ones_like(velocity), velocity, *rubbing])[:, kept]
-        acceleration, _, self.velocity = own[:3]
         regressors = np.array([
             model.regressor(*row) for row in zip(smooth, self.velocity, acceleration, strict=True)
         ])  # fmt: skip

@@ -73,6 +73,8 @@ def _calibrate(arguments: argparse.Namespace, stop: Stop) -> None:
         given = {'torque_constants': found.calibration.torque_constants}
         alone = Arm(urdf, values | found_anew | given)
         alone.run(t, q, effort, *velocity)
+        if alone.doubts.text and not alone.doubts.payload:
+            raise ConfigurationError(f'recording: by the URDF alone, {alone.doubts.text}')
         # The log-odds of contact that this free motion reaches once a minute.
         free = Arm(urdf, values, calibration=found.calibration)
         odds = np.nan_to_num(free.run(t, q, effort, *velocity).log_odds, nan=-np.inf)
