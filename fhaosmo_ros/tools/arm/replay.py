@@ -104,3 +104,5 @@ def _replay(arguments: argparse.Namespace, stop: Stop) -> None:
     print(f'{arm.counters.pop("used", 0)} samples used, {contacts} contacts: {arguments.output}')
     for what, count in arm.counters.items():
         print(f'{what}: {count} samples')
+    if arm.doubts.text:
+        print(f'At the end: {arm.doubts.text}')
