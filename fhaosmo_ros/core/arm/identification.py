@@ -249,7 +249,8 @@ class _Regression:
             weights = (np.minimum(1.0, HUBER / np.maximum(far, 1e-12)) ** 0.5 / size).ravel()
             weighted = a * weights[:, np.newaxis]
             normal = weighted.T @ weighted
-            normal.flat[:: len(x) + 1] += draw * len(b) * 1e-3 + 1e-9
+            rounding = len(x) * np.finfo(np.float64).eps * np.trace(normal)
+            normal.flat[:: len(x) + 1] += draw * len(b) * 1e-3 + rounding
             right = weighted.T @ (b.ravel() * weights)
             x = np.linalg.solve(normal, right)
         return np.asarray((self._possible(normal, right) if possible else x) * self._scale)
