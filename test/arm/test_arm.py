@@ -91,6 +91,13 @@ def test_other_joints_than_revolute_ones_with_limits(urdf):
     assert arm.counters == {'used': len(t) - 1}
 
 
+@pytest.mark.parametrize('measurement', ['position', 'velocity'])
+def test_the_first_estimates_are_as_good_as_later_ones(measurement):
+    t, q, v, torque = motion(MODEL, 8e-3 * np.arange(100))
+    found = Arm(URDF, measurement=measurement).run(t, q, torque, v)
+    assert np.nanmax(np.abs(found.external_torque)) < 0.05
+
+
 def test_without_noise_one_filter_is_the_kalman_filter():
     """One joint, weights fixed by rates of zero: compare with the textbook recursion."""
     h, w, r, e = 1e-3, 4.0, 1e-8, 0.01

@@ -267,8 +267,9 @@ class Arm:
             wide = samples.variance[1] / (h * h) if self._of_position else samples.variance[2]
             spread = (mass * (2.0 * wide)) @ mass.T
             bank.start(mass, drive, mass @ known, spread, self._model_variance)
-        change = way if self._of_position else velocity
-        bank.step(h, mass, change, vague, drive, self._reach)
+        else:
+            change = way if self._of_position else velocity
+            bank.step(h, mass, change, vague, drive, self._reach)
         self._velocity = self.model.velocity_of(self._momentum)
         if not samples.is_possible(2, self._velocity):  # C^T qd grows with its square
             samples.reset()
