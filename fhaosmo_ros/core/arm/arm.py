@@ -87,7 +87,7 @@ class Arm:
     problem : str
         Which of these happened to the latest sample, if that was not used.
     doubts : Doubts
-        Says which setting seems to be wrong. Unless it is a payload, there is no estimate then.
+        Says which setting seems to be wrong. Unless that is `mild`, there is no estimate then.
 
     Raises
     ------
@@ -276,7 +276,7 @@ class Arm:
             self.problem = 'diverged'
             return None
         self.doubts.take(h, q, torque, self._external)
-        if self.doubts.text and not self.doubts.payload:
+        if self.doubts.text and not self.doubts.mild:
             self.problem = 'doubted'
             return None
         return self._estimate(stamp, q, self._velocity)

@@ -26,7 +26,7 @@ class Doubts:
     Looks for mistakes in what the external torques of an arm have in common.
 
     `with_gravity`: torques are said to contain it. `error` (n,): of the model, N m. `text` says
-    what is found, and `payload` whether that is a payload.
+    what is found, and `mild` whether it may be no mistake, so that estimates go on.
     """
 
     def __init__(self, model: ArmModel, with_gravity: bool, error: Floats) -> None:
@@ -37,7 +37,7 @@ class Doubts:
         """Begin anew, as for another payload."""
         self._time = 0.0
         self._sums: list[Any] = [0.0] * 6
-        self.text, self.payload = '', False
+        self.text, self.mild = '', False
 
     def take(self, h: float, q: Floats, effort: Floats, torque: Floats) -> None:
         """Look at a sample, `h` seconds after the one before; `torque` is the external one."""
@@ -52,7 +52,7 @@ class Doubts:
         news = 1.0, q, q**2, scaled**2, a.T @ a, a.T @ scaled
         self._sums = [keep * old + new for old, new in zip(self._sums, news, strict=True)]
         if EVERY * self._sums[0] > LEAST:
-            self.payload = False
+            self.mild = False
             self.text = self._explanation()
 
     def _explanation(self) -> str:
@@ -66,16 +66,17 @@ class Doubts:
         if not (moved and large):
             return ''
 
-        def fit(part: slice, least: float) -> Floats | None:
-            """Return the factors of a mistake that explains the torque, None if it does not."""
+        def fit(part: slice, least: float) -> tuple[Floats, float]:
+            """Return the factors of a mistake, and the share of the torque that it explains."""
             values = np.linalg.eigvalsh(normal[part, part])
             if not values[0] > least * values[-1]:
-                return None
+                return 0.0 * values, 0.0
             factors = np.asarray(np.linalg.solve(normal[part, part], seen[part]))
-            return factors if seen[part] @ factors > EXPLAINED * np.sum(squares) else None
+            return factors, seen[part] @ factors / np.sum(squares)
 
-        change = fit(slice(0, 3), SEEN[0])
-        if change is not None:
+        change, by_gravity = fit(slice(0, 3), SEEN[0])
+        more, by_payload = fit(slice(3, 7), SEEN[1])
+        if by_gravity > EXPLAINED:
             known = self._model.gravity
             gravity, usual = self._with_gravity * known - change, np.linalg.norm(known) or USUAL
             size = np.linalg.norm(gravity) / usual
@@ -92,14 +93,19 @@ class Doubts:
             if cosine < 0.98 and 0.7 < size < 1.4:
                 text = ', '.join(f'{x:.1f}' for x in gravity)
                 return f"gravity is as if it were [{text}] in the base's frame: parameter gravity"
+            if self._with_gravity and cosine > 0.9 and by_gravity > by_payload:
+                self.mild = True
+                return (
+                    f'effort is {size:.2g} times what the model needs against gravity: is it in '
+                    'N m (parameter torque_constants), and has calibrate found the masses?'
+                )
         slopes = seen[7:] / np.maximum(own, 1e-12)
         reverses = (np.abs(slopes + 2.0) < 0.5) & (squares > LARGE**2 * count)
         wrong = reverses & (seen[7:] * slopes > EXPLAINED * squares)
         if wrong.any():
             names = ', '.join(np.array(self._model.joints)[wrong])
             return f'the effort of {names} has the wrong sign'
-        more = fit(slice(3, 7), SEEN[1])
-        if more is None:
+        if by_payload < EXPLAINED:
             return ''
         known = (self._model.inertial - self._model.unloaded)[-1, :4] * self._with_gravity
         mass, *moments = known + more
@@ -107,7 +113,7 @@ class Doubts:
             mass, moments = 0.0, [0.0] * 3
         if mass <= known[0] == 0.0:
             return ''
-        self.payload = True
+        self.mild = True
         numbers = ', '.join(f'{x:.3g}' for x in (mass, *(x / (mass or 1.0) for x in moments)))
         told = '' if self._with_gravity else ', and tell the controller, which compensates gravity'
         return (

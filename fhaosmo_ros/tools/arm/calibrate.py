@@ -73,7 +73,7 @@ def _calibrate(arguments: argparse.Namespace, stop: Stop) -> None:
         given = {'torque_constants': found.calibration.torque_constants}
         alone = Arm(urdf, values | found_anew | given)
         alone.run(t, q, effort, *velocity)
-        if alone.doubts.text and not alone.doubts.payload:
+        if alone.doubts.text and not alone.doubts.mild:
             raise ConfigurationError(f'recording: by the URDF alone, {alone.doubts.text}')
         # The log-odds of contact that this free motion reaches once a minute.
         free = Arm(urdf, values, calibration=found.calibration)
