@@ -233,6 +233,15 @@ def test_efforts_of_zero_are_no_torque_of_an_arm_that_rests():
     assert arm.doubts.text == 'all efforts are zero: does the driver measure them?'
 
 
+def test_an_arm_that_rests_does_not_take_back_what_was_said():
+    arm, (t, q, _, torque) = Arm(URDF), motion(MODEL, np.arange(0.0, 10.0, 4e-3))
+    arm.run(t, q, -torque)
+    rest = q[-1] + NOISE * np.random.default_rng(0).standard_normal((2000, 3))
+    weight = -np.tile(MODEL.terms(q[-1], np.zeros(3)).gravity, (2000, 1))
+    found = arm.run(10.0 + 0.05 * np.arange(2000), rest, weight)
+    assert np.isnan(found.external_torque).all()
+
+
 def test_a_contact_does_not_flicker_where_false_alarms_are_allowed(free):
     arm = Arm(URDF, false_alarms_per_minute=60.0)
     found = run(arm, free, push=np.sin(free[0])[:, np.newaxis])

@@ -135,7 +135,7 @@ def test_commands_calibrate_find_a_payload_and_replay_a_bag(tmp_path, capsys):
     assert calibrate.main(['--bag', str(bag), '-o', str(file), *wrong]) == 2
     assert 'by the URDF alone, the efforts of all joints' in capsys.readouterr().err
     assert replay.main([str(bag), '-o', str(tmp_path / 'wrong.csv'), *wrong]) == 0
-    assert 'At the end: the efforts of all joints' in capsys.readouterr().out
+    assert 'the efforts of all joints have the wrong sign' in capsys.readouterr().out
     known = ['-p', f'calibration_file:={file}']
     assert calibrate.main(['--bag', str(bag), '--payload', *known]) == 0
     left = [

@@ -163,6 +163,7 @@ class Arm:
         with self._alone:
             self._samples.reset()
             self._forget()
+            self.doubts.reset()
 
     def _forget(self) -> None:
         # Samples that wait for their torque: time (s), stamp, `h`, `vague` and `latest`. Then the
@@ -173,7 +174,6 @@ class Arm:
         self._contact = False
         self._looked, self._evidence = 0, self._rest  # stamp, and log-likelihood of each link
         self._reach = np.zeros((len(self._rest), len(self._rest)))
-        self.doubts.reset()
 
     def adopt(self, parameters: Parameters) -> None:
         """Go on with other live parameters; raise ConfigurationError for a bad payload."""

@@ -52,7 +52,6 @@ class Doubts:
         news = 1.0, q, q**2, scaled**2, a.T @ a, a.T @ scaled
         self._sums = [keep * old + new for old, new in zip(self._sums, news, strict=True)]
         if EVERY * self._sums[0] > LEAST:
-            self.mild = False
             self.text = self._explanation()
 
     def _explanation(self) -> str:
@@ -61,9 +60,12 @@ class Doubts:
         own = np.diag(normal)[7:]  # of efforts
         moved = np.max(square / count - (mean / count) ** 2) > MOVED**2
         large = np.mean(squares) > LARGE**2 * count
+        if large and own.any() and not moved:
+            return self.text  # an arm that rests shows nothing new
+        self.mild = False
         if (moved or large) and not own.any():
             return 'all efforts are zero: does the driver measure them?'
-        if not (moved and large):
+        if not large:
             return ''
 
         def fit(part: slice, least: float) -> tuple[Floats, float]:
@@ -105,13 +107,11 @@ class Doubts:
         if wrong.any():
             names = ', '.join(np.array(self._model.joints)[wrong])
             return f'the effort of {names} has the wrong sign'
-        if by_payload < EXPLAINED:
-            return ''
         known = (self._model.inertial - self._model.unloaded)[-1, :4] * self._with_gravity
         mass, *moments = known + more
         if mass < PUT_DOWN * known[0]:
             mass, moments = 0.0, [0.0] * 3
-        if mass <= known[0] == 0.0:
+        if by_payload < EXPLAINED or mass <= known[0] == 0.0:
             return ''
         self.mild = True
         numbers = ', '.join(f'{x:.3g}' for x in (mass, *(x / (mass or 1.0) for x in moments)))

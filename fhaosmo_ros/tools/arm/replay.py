@@ -85,7 +85,7 @@ def joint_samples(reader: BagReader, topic: str, arm: Arm) -> Iterator[tuple[int
 
 
 def _replay(arguments: argparse.Namespace, stop: Stop) -> None:
-    contacts, touched = 0, False
+    contacts, touched, doubt = 0, False, ''
     with stop.raising(), BagReader(arguments.bag) as reader:
         arm = Arm(description(reader, arguments), arm_parameters(arguments))
         with (
@@ -95,7 +95,9 @@ def _replay(arguments: argparse.Namespace, stop: Stop) -> None:
             table, deviations = csv.writer(file), [f'{name}_deviation' for name in arm.joints]
             table.writerow(['stamp_ns', *arm.joints, *deviations, 'log_odds', 'link'])
             for stamp, arrays in joint_samples(reader, arguments.topic, arm):
-                if (found := arm.take(stamp, *arrays)) is None:
+                found = arm.take(stamp, *arrays)
+                doubt = arm.doubts.text or doubt
+                if found is None:
                     continue
                 contacts += found.contact and not touched
                 touched = found.contact
@@ -104,5 +106,5 @@ def _replay(arguments: argparse.Namespace, stop: Stop) -> None:
     print(f'{arm.counters.pop("used", 0)} samples used, {contacts} contacts: {arguments.output}')
     for what, count in arm.counters.items():
         print(f'{what}: {count} samples')
-    if arm.doubts.text:
-        print(f'At the end: {arm.doubts.text}')
+    if doubt:
+        print(doubt)
