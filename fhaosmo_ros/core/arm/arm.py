@@ -122,7 +122,7 @@ class Arm:
         given = self._values('torque_constants')
         constants = np.where(given == 1.0, known.torque_constants, given)
         scale = model.torque_of_weight()
-        scale = np.maximum(scale, LEAST * np.max(scale))
+        scale = self._weight = np.maximum(scale, LEAST * np.max(scale))
         usual = [TORQUE_NOISE * scale, self._values('position_noise'), MODEL_ERROR * scale]
         found = np.array([known.torque_noise, known.position_noise, known.model_error])
         of_torque, of_position, error = np.where(found > 0.0, found, usual)
@@ -266,7 +266,7 @@ class Arm:
         if before is None:
             wide = samples.variance[1] / (h * h) if self._of_position else samples.variance[2]
             spread = (mass * (2.0 * wide)) @ mass.T
-            bank.start(mass, drive, mass @ known, spread, self._model_variance)
+            bank.start(mass, drive, mass @ known, spread, self._model_variance, self._weight**2)
         else:
             change = way if self._of_position else velocity
             bank.step(h, mass, change, vague, drive, self._reach)

@@ -87,25 +87,27 @@ cdef class Bank:
         self.w, self.mixed, self.anew, self.likelihood = np.zeros((4, m))
         self.mass, self.middle, self.noise = np.zeros((3, n, n))
         self.drive, self.mean_drive, self.measured = np.zeros((3, n))
-        self.start(0.0, 0.0, np.zeros(n), np.zeros((n, n)), np.zeros(n))
+        self.start(0.0, 0.0, np.zeros(n), np.zeros((n, n)), np.zeros(n), np.zeros(n))
 
-    def start(self, mass, drive, momentum, momentum_covariance, torque_variance):
+    def start(self, mass, drive, momentum, momentum_covariance, free_variance, variance):
         """
-        Begin in free motion.
+        Begin as if the arm had moved for long, so that it may be in contact.
 
         With M (n, n) and u (n,) of the first sample, p = M qd (n,) and its covariance (n, n), and
-        the variance of d (n,).
+        the variance of d (n,) in free motion, and else.
         """
         cdef int n = self.joints
+        cdef double contact = fmax(self.begin / fmax(self.begin + self.end, SMALLEST), SMALLEST)
         np.asarray(self.mass)[...], np.asarray(self.drive)[...] = mass, drive
         s = np.asarray(self.s)
         s[...] = 0.0
         s[:, 0, n : 2 * n] = momentum
         s[:, 1 + n : 1 + 2 * n, n : 2 * n] = momentum_covariance
-        s[:, 1 + 2 * n :, 2 * n :] = np.diag(torque_variance)
-        self.w[:] = SMALLEST
-        self.w[0] = 1.0
-        self.log_odds = log(SMALLEST)
+        s[:, 1 + 2 * n :, 2 * n :] = np.diag(variance)
+        s[0, 1 + 2 * n :, 2 * n :] = np.diag(free_variance)
+        self.w[:] = contact / (self.filters - 1)
+        self.w[0] = 1.0 - contact
+        self.log_odds = log(contact)
         self.mean[...] = s[0, 0].reshape(3, n)
         self.covariance[...] = s[0, 1 + 2 * n :, 2 * n :]
 
