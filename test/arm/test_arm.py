@@ -222,33 +222,28 @@ def test_a_setting_that_is_wrong_is_said(wrong, options, text):
     arm = Arm(URDF, {'gravity': gravity, **options})
     found = arm.run(t, q, wrong(torque, g, load))
     assert text in arm.doubts.text
-    goes_on = 'payload' in text or 'times' in text  # which may be no mistake
+    goes_on = any(word in text for word in ('payload', 'times'))  # which may be no mistake
     assert np.isfinite(found.external_torque[-1]).all() == goes_on
     arm.adopt(arm.parameters | {'payload': payload[::-1]})
     assert not arm.doubts.text
 
 
-def test_efforts_of_zero_are_no_torque_of_an_arm_that_rests():
-    arm, rest = Arm(URDF), np.ones((1500, 3))
-    assert np.isnan(arm.run(4e-3 * np.arange(1500), rest, 0.0 * rest).external_torque[-1]).all()
-    assert arm.doubts.text == 'all efforts are zero: does the driver measure them?'
-
-
-def test_an_arm_that_rests_does_not_take_back_what_was_said():
+def test_an_arm_that_rests_has_effort_and_does_not_take_back_what_was_said():
     arm, (t, q, _, torque) = Arm(URDF), motion(MODEL, np.arange(0.0, 10.0, 4e-3))
     arm.run(t, q, -torque)
     rest = q[-1] + NOISE * np.random.default_rng(0).standard_normal((2000, 3))
     weight = -np.tile(MODEL.terms(q[-1], np.zeros(3)).gravity, (2000, 1))
     found = arm.run(10.0 + 0.05 * np.arange(2000), rest, weight)
     assert np.isnan(found.external_torque).all()
+    arm = Arm(URDF)
+    assert np.isnan(arm.run(0.05 * np.arange(2000), rest, 0.0 * rest).external_torque[-1]).all()
 
 
 def test_a_contact_does_not_flicker_where_false_alarms_are_allowed(free):
     arm = Arm(URDF, false_alarms_per_minute=60.0)
     found = run(arm, free, push=np.sin(free[0])[:, np.newaxis])
     ends = np.flatnonzero(found.contact[:-1] & ~found.contact[1:]) + 1
-    assert len(ends)
-    assert np.all(found.log_odds[ends] <= arm._threshold)
+    assert len(ends) > np.sum(found.log_odds[ends] > arm._threshold) == 0
 
 
 def test_a_wrench_is_found_at_a_frame_and_what_cannot_be_seen_is_said(free):
