@@ -96,6 +96,7 @@ cdef struct Shared:
     double unsettled  # time since covariances began to move (s)
     double steady_period  # interval that they are those of (s)
     double usual_interval  # between samples that were not stamped late (s)
+    double gathered, waiting  # time since it was last followed (s), and samples
     double flow_period  # interval that the flow is that of (s)
     double first_noise  # variance of the noise when the members began
     double first_period  # mean interval of the first samples (s)

@@ -12,7 +12,7 @@ cdef double bound_of_noise(Members* m, int colour, int order) noexcept nogil
 cdef bint is_even(Members* m) noexcept nogil
 cdef double usual_speed(Members* m) noexcept nogil
 cdef void follow_differences(Members* m, double y, double h) noexcept nogil
-cdef double periods(Members* m, double interval) noexcept nogil
+cdef void follow_usual_interval(Members* m, double passed) noexcept nogil
 cdef void follow_stamps(Members* m, double interval, double change) noexcept nogil
 cdef VECTORISED fill_noise(Members* m) noexcept nogil
 cdef VECTORISED find_knowing(Members* m, bint unlikely_before) noexcept nogil

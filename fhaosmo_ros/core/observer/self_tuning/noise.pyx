@@ -199,6 +199,22 @@ cdef double periods(Members* m, double interval) noexcept nogil:
     return fmax(round(interval / m.shared.usual_interval), 1.0)
 
 
+cdef void follow_usual_interval(Members* m, double passed) noexcept nogil:
+    """
+    Follow the usual interval by the time that has passed for a sample that is used.
+
+    Samples of a burst count together, until half of a usual interval has passed.
+    """
+    cdef Shared* shared = &m.shared
+    cdef double usual
+    shared.gathered += passed
+    shared.waiting += 1.0
+    if shared.gathered > 0.5 * shared.usual_interval:
+        usual = shared.gathered / fmax(periods(m, shared.gathered), shared.waiting)
+        shared.usual_interval += (usual - shared.usual_interval) / m.work.sample.average
+        shared.gathered = shared.waiting = 0.0
+
+
 cdef void follow_stamps(Members* m, double interval, double change) noexcept nogil:
     """
     Follow what changes of the interval say that the variance of the stamps is at most (D 29).

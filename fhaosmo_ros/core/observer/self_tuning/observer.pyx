@@ -18,8 +18,8 @@ from fhaosmo_ros.core.observer.self_tuning.members cimport (
 )
 from fhaosmo_ros.core.observer.self_tuning.noise cimport (
     APART, FADED, LATTICE_SHARE, ROUNDED, STEADY, bound_of_noise, fill_noise, find_knowing,
-    follow_differences, follow_noise, follow_quantum, follow_stamps, is_even, is_likely,
-    periods, rounding, usual_speed
+    follow_differences, follow_noise, follow_quantum, follow_stamps, follow_usual_interval,
+    is_even, is_likely, rounding, usual_speed
 )
 from fhaosmo_ros.core.observer.self_tuning.weights cimport (
     Model, find_tuning, gather, judge, mix, tell_model, weigh
@@ -248,11 +248,8 @@ cdef class SelfTuning(Structure):
         likely = is_likely(m, gate, late)
         if even and (not likely or self.may_have_waited(change)):
             likely = self.is_stamped_late(h, u, gate) or likely
-        # Samples that are used tell the usual interval, but for those of a burst.
-        if likely and memory.beyond == 0.0 and self.passed > 0.5 * shared.usual_interval:
-            shared.usual_interval += (
-                self.passed / periods(m, self.passed) - shared.usual_interval
-            ) / sample.average
+        if likely and memory.beyond == 0.0:
+            follow_usual_interval(m, self.passed)
         begins = has_jumped(m, memory.beyond) and not likely
         expected = w.believed[shared.likeliest] * w.noise[shared.likeliest]
         shared.recent = fmax(shared.recent - 1.0, 0.0)
