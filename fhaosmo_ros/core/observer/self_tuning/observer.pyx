@@ -226,7 +226,7 @@ cdef class SelfTuning(Structure):
         cdef Memory* memory = &self.memory
         cdef double mean[MOST_STATES]
         cdef double expected, speed, change, late, gate
-        cdef bint goes_on, likely, begins, jumped, rough, even
+        cdef bint goes_on, likely, begins, jumped, rough, even, timed
         cdef int i, since_jump
         sample.quanta = rounding(m)
         if choose_members(m):
@@ -247,10 +247,12 @@ cdef class SelfTuning(Structure):
         gate = HUBER if goes_on else GATE
         likely = is_likely(m, gate, late)
         if even and (not likely or self.may_have_waited(change)):
-            likely = self.is_stamped_late(h, u, gate) or likely
+            likely = self.is_likely_when_even(h, u, gate)
         if likely and memory.beyond == 0.0:
             follow_usual_interval(m, self.passed)
-        begins = has_jumped(m, memory.beyond) and not likely
+        # How large a jump is, nobody knows where it is not known how much time has passed.
+        timed = fabs(memory.behind) <= shared.usual_interval
+        begins = has_jumped(m, memory.beyond) and timed and not likely
         expected = w.believed[shared.likeliest] * w.noise[shared.likeliest]
         shared.recent = fmax(shared.recent - 1.0, 0.0)
         # After a jump y moves less smoothly than before, but farther than noise would put it off;
@@ -340,9 +342,11 @@ cdef class SelfTuning(Structure):
             off = fmin(off, fabs(change))
         return off > fmax(0.5 * usual, HUBER * sqrt(2.0 * shared.jitter))
 
-    cdef bint is_stamped_late(self, double h, const double* u, double gate) noexcept nogil:
+    cdef bint is_likely_when_even(
+        self, double h, const double* u, double gate
+    ) noexcept nogil:
         """
-        Return True if an evenly spaced sample is likelier at another time than its stamp says.
+        Take an evenly spaced sample at the likeliest of its times; return True if it is likely.
 
         Samples wait for a busy host, which stamps them as it reads them. So the time since the
         last sample that was used may be the usual one; or, if that sample was late, the one of the
@@ -351,16 +355,16 @@ cdef class SelfTuning(Structure):
         """
         cdef Memory* memory = &self.memory
         cdef double usual = (memory.beyond + 1.0) * self.members.shared.usual_interval
-        cdef double passed = h - memory.behind, likelihood
-        if memory.behind == 0.0 or not 0.5 * usual < passed < 2.0 * usual:
-            passed = usual + memory.behind / NOISE_SAMPLES
-        likelihood = self.likelihood()
-        self.look(passed, u)
-        if is_likely(self.members, gate, 0.0) and self.likelihood() > likelihood:
-            self.passed = passed
-            return True
-        self.look(h, u)
-        return False
+        cdef double late = fmax(fmin(memory.behind, usual), -usual), most = self.likelihood()
+        cdef double[2] others = [usual + late / NOISE_SAMPLES, h - memory.behind]
+        cdef bint nearly = memory.behind != 0.0 and 0.5 * usual < others[1] < 2.0 * usual
+        cdef int i
+        for i in range(2 if nearly else 1):
+            self.look(others[i], u)
+            if self.likelihood() > most:
+                most, self.passed = self.likelihood(), others[i]
+        self.look(self.passed, u)
+        return is_likely(self.members, gate, 0.0)
 
     cdef double likelihood(self) noexcept nogil:
         """Return twice the log-likelihood of the sample, for the likeliest member."""
