@@ -48,6 +48,7 @@ WRONG = {
     # arm
     'calibrate --bag joints --payload': ['calibration_file:=FILE'],
     'calibrate --bag joints': ['one robot on /robot_description', '--robot URDF'],
+    'calibrate --bag joints --robot joints/joints.mcap': ['--robot: expected a URDF'],
     'calibrate --bag joints --robot three.urdf': ['messages on /joint_states, got none'],
     'calibrate --bag joints --robot three.urdf --topic /y': ['joint states of turn', 'lacks'],
     # play, record, demo

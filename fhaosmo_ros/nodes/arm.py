@@ -81,7 +81,8 @@ class ArmNode(BaseNode):
         }
         self._listeners = endpoints.Listeners(self._outputs)
         if values['robot_description_file']:
-            self._use(text_of(values, 'robot_description_file', 'a URDF'))
+            expected = "parameter 'robot_description_file': expected a URDF"
+            self._use(text_of(values['robot_description_file'], expected))
         else:
             self._topic = self.resolve_topic_name('robot_description')
             self._missing = f'no robot yet on {self._topic}'

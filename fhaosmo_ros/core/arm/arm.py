@@ -107,7 +107,8 @@ class Arm:
         self.model = model = ArmModel(urdf, joints=chosen, gravity=p['gravity'])
         self.joints, n = model.joints, len(model.joints)
         if calibration is None and p['calibration_file']:
-            calibration = Calibration.loads(text_of(p, 'calibration_file', 'a YAML file'))
+            expected = "parameter 'calibration_file': expected a YAML file"
+            calibration = Calibration.loads(text_of(p['calibration_file'], expected))
         self._calibrated, self._alone = calibration is not None, RLock()  # a second thread waits
         known = self.calibration = calibration or Calibration.of_urdf(model)
         if known.joints != model.joints:
@@ -366,11 +367,9 @@ def payload_of(p: Parameters) -> list[float]:
     return payload
 
 
-def text_of(parameters: Parameters, name: str, expected: str) -> str:
-    """Return the text of the file that a parameter names; raise ConfigurationError without it."""
-    path = parameters[name]
+def text_of(path: str | Path, expected: str) -> str:
+    """Return a file's text; raise ConfigurationError, with what is `expected`, without it."""
     try:
         return Path(path).expanduser().read_text(encoding='utf-8')
     except (OSError, UnicodeDecodeError) as error:
-        text = f"parameter '{name}': expected {expected}, got {path} ({error})"
-        raise ConfigurationError(text) from None
+        raise ConfigurationError(f'{expected}, got {path} ({error})') from None

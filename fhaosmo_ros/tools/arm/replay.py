@@ -7,7 +7,7 @@ import csv
 from pathlib import Path
 from typing import Any
 
-from fhaosmo_ros.core.arm.arm import Arm
+from fhaosmo_ros.core.arm.arm import Arm, text_of
 from fhaosmo_ros.core.parameters.arm import ARM_PARAMETERS
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.files import load
@@ -58,7 +58,7 @@ def arm_parameters(arguments: argparse.Namespace) -> dict[str, Any]:
 def description(reader: BagReader, arguments: argparse.Namespace) -> str:
     """Return the URDF: a file's, else the bag's."""
     if arguments.robot:
-        return str(arguments.robot.read_text(encoding='utf-8'))
+        return text_of(arguments.robot, '--robot: expected a URDF')
     found = {m.data for _, _, m in reader.read_all([DESCRIPTION])}
     if len(found) != 1:
         raise ConfigurationError(
