@@ -30,7 +30,6 @@ FIELDS = {
     'joint_states': {'position': 'position', 'velocity': 'velocity'},
 }
 """What the fields of a JointState are in `ArmEstimate`."""
-OTHERS = {'external_wrench': WrenchStamped, 'event': DiagnosticArray}
 SERVICES = {
     'reset': 'the estimates begin anew with the next sample',
     'tare': 'the present external torque counts as zero',
@@ -72,9 +71,9 @@ class ArmNode(BaseNode):
         self._published, self._latest = -np.inf, -np.inf
         self._contact: bool | None = False  # None: not known
         self._estimate: ArmEstimate | None = None
-        kinds = dict.fromkeys(FIELDS, JointState) | OTHERS
-        if not values['wrench_frame']:
-            del kinds['external_wrench']
+        kinds = dict.fromkeys(FIELDS, JointState) | {'event': DiagnosticArray}
+        if values['wrench_frame']:
+            kinds['external_wrench'] = WrenchStamped
         self._outputs = {
             topic: endpoints.create_publisher(self, kind, f'~/{topic}', latched=topic == 'event')
             for topic, kind in kinds.items()

@@ -295,7 +295,7 @@ class Arm:
                 # For each link how likely a force on it makes this torque, as a logarithm.
                 size = torques @ torques / np.maximum(np.trace(reach, axis1=1, axis2=2), 1e-12)
                 spread = covariance + size[:, np.newaxis, np.newaxis] * reach
-                missed = np.linalg.solve(spread, np.tile(torques[:, np.newaxis], (len(q), 1, 1)))
+                missed = np.linalg.solve(spread, torques[np.newaxis, :, np.newaxis])
                 own = -0.5 * (np.linalg.slogdet(spread)[1] + missed[..., 0] @ torques)
                 self._evidence = KEEP * self._evidence + own if touched else own
                 likely = np.exp(self._evidence - np.max(self._evidence))
@@ -350,12 +350,11 @@ class Arm:
 
         """
         jacobian = self.model.frame_jacobian(estimate.position, frame)
-        root = np.linalg.cholesky(estimate.covariance)
-        weighted = np.linalg.solve(root, jacobian.T)  # (n, 6)
+        weighted = np.linalg.solve(estimate.covariance, jacobian.T)  # (n, 6)
         values = np.linalg.svd(jacobian, compute_uv=False)
         prior = DAMPING**2 / np.mean(np.diag(estimate.covariance)) * np.eye(6)
-        covariance = np.linalg.inv(weighted.T @ weighted + prior)
-        found = covariance @ weighted.T @ np.linalg.solve(root, estimate.external_torque)
+        along = weighted.T @ estimate.external_torque
+        found = np.linalg.solve(jacobian @ weighted + prior, along)
         return found, bool(len(values) < 6 or values[-1] < DAMPING)
 
 

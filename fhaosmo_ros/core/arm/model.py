@@ -265,7 +265,7 @@ class Calibration:
 
     def friction(self, velocity: Floats) -> Floats:
         """Return friction and offset at velocities (..., n), in N m."""
-        dry = np.sum(self.coulomb * np.tanh(velocity[..., np.newaxis] / WIDTHS), axis=-1)
+        dry = (self.coulomb * np.tanh(velocity[..., np.newaxis] / WIDTHS)).sum(axis=-1)
         return np.asarray(self.offset + self.viscous * velocity + dry)
 
     def dumps(self) -> str:

@@ -197,12 +197,9 @@ cdef class Samples:
         if not n == likely.shape[0] == momentum.shape[0]:
             raise ValueError(f'expected arrays of {n} joints')
         try:
-            e, q, v = effort, position, velocity
-        except (TypeError, ValueError):  # no arrays of doubles, as library users may have them
-            try:
-                e, q, v = [np.asarray(a, dtype=np.float64) for a in (effort, position, velocity)]
-            except (TypeError, ValueError):
-                return 'wrong size'
+            e, q, v = [np.asarray(a, dtype=np.float64) for a in (effort, position, velocity)]
+        except (TypeError, ValueError):
+            return 'wrong size'
         if not n == e.shape[0] == q.shape[0] == v.shape[0]:
             return 'wrong size'
         for k in range(n):
