@@ -103,8 +103,8 @@ def test_without_noise_one_filter_is_the_kalman_filter():
     """One joint, weights fixed by rates of zero: compare with the textbook recursion."""
     h, w, r, e = 1e-3, 4.0, 1e-8, 0.01
     bank = Bank([w], 1e-9, [1.0], (0.0, 0.0, 0.0), np.array([[e], [r], [0.0]]))
-    bank.start(1.0, 0.0, [0.0], [[1.0]], [1.0], [1.0])
-    x, p = np.zeros(3), np.diag([0.0, 1.0, 1.0])
+    bank.start(h, np.eye(1), np.zeros(1), 0.0, [1.0])
+    x, p = np.zeros(3), np.diag([0.0, 2.0 * r / h**2, w / 2e-9])
     f, q = discrete(np.eye(3, k=1), np.diag([0.0, 0.0, w]), h)
     g = np.array([h * h / 2, h, 0.0])
     q = q + np.outer(g, g) * e

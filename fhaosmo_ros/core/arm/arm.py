@@ -127,7 +127,6 @@ class Arm:
         usual = [TORQUE_NOISE * scale, self._values('position_noise'), MODEL_ERROR * scale]
         found = np.array([known.torque_noise, known.position_noise, known.model_error])
         of_torque, of_position, error = np.where(found > 0.0, found, usual)
-        self._model_variance = error**2
         self.doubts = Doubts(model, self._with_gravity, error)
         # Of efforts, positions and velocities: at first, and at least.
         noise = np.array([of_torque, of_position, self._values('velocity_noise')])
@@ -142,7 +141,7 @@ class Arm:
             noise, least, limits, constants, STOPPING * strong, model.continuous, self._of_position
         )
         self._bank = Bank(
-            2.0 * DECAY * self._model_variance, DECAY, np.array(INTENSITIES) * model.weight, RATES,
+            2.0 * DECAY * error**2, DECAY, np.array(INTENSITIES) * model.weight, RATES,
             self._samples.variance, ONSET, SINCE if self._of_position else 0.0, self._of_position,
         )  # fmt: skip
         self._momentum, self._external = self._bank.mean[1:]  # written anew by each step
@@ -242,17 +241,17 @@ class Arm:
         self, torque: Floats, stamp: int, h: float, vague: float, sample: Floats
     ) -> ArmEstimate | None:
         """Go on to a sample, `h` seconds after the one before; see `Samples`."""
-        q, velocity, way = sample[1], sample[2], sample[3]
+        q, change = sample[1], sample[3] if self._of_position else sample[2]
         bank, samples, before = self._bank, self._samples, self._velocity
         if before is None or not self._of_position:
-            known = self._sliding = way / h if self._of_position else velocity
+            known = self._sliding = change / h if self._of_position else change
             self._faster = self._rest
         else:
             known = before
             if self._calibrated:
                 # A line: by their mean friction would turn round too late, which is a contact.
                 keep, ahead = np.exp(-h / SLIDING), self._sliding + h * self._faster
-                news = way / h - ahead
+                news = change / h - ahead
                 self._sliding = ahead + (1.0 - keep**2) * news
                 self._faster = self._faster + (1.0 - keep) ** 2 / h * news
         mass, turning, gravity = self.model.terms(q, known)
@@ -265,11 +264,8 @@ class Arm:
             # back, worst at joints of little inertia. What they say is of half a sample ago.
             drive -= self.calibration.friction(self._sliding + 0.5 * h * self._faster)
         if before is None:
-            wide = samples.variance[1] / (h * h) if self._of_position else samples.variance[2]
-            spread = (mass * (2.0 * wide)) @ mass.T
-            bank.start(mass, drive, mass @ known, spread, self._model_variance, self._weight**2)
+            bank.start(h, mass, change, drive, self._weight**2)
         else:
-            change = way if self._of_position else velocity
             bank.step(h, mass, change, vague, drive, self._reach)
         self._velocity = self.model.velocity_of(self._momentum)
         if not samples.is_possible(2, self._velocity):  # C^T qd grows with its square

@@ -87,24 +87,25 @@ cdef class Bank:
         self.w, self.mixed, self.anew, self.likelihood = np.zeros((4, m))
         self.mass, self.middle, self.noise = np.zeros((3, n, n))
         self.drive, self.mean_drive, self.measured = np.zeros((3, n))
-        self.start(0.0, 0.0, np.zeros(n), np.zeros((n, n)), np.zeros(n), np.zeros(n))
+        self.start(1.0, np.zeros((n, n)), np.zeros(n), 0.0, np.zeros(n))
 
-    def start(self, mass, drive, momentum, momentum_covariance, free_variance, variance):
+    def start(self, double h, mass, change, drive, variance):
         """
         Begin as if the arm had moved for long, so that it may be in contact.
 
-        With M (n, n) and u (n,) of the first sample, p = M qd (n,) and its covariance (n, n), and
-        the variance of d (n,) in free motion, and else.
+        The first sample is as in `step`; `variance` (n,) is that of d in contact.
         """
         cdef int n = self.joints
         cdef double contact = fmax(self.begin / fmax(self.begin + self.end, SMALLEST), SMALLEST)
+        cdef double unit = h if self.of_position else 1.0  # `change` by this is a velocity
+        wide = 2.0 * np.asarray(self.variance)[1 if self.of_position else 2] / (unit * unit)
         np.asarray(self.mass)[...], np.asarray(self.drive)[...] = mass, drive
         s = np.asarray(self.s)
         s[...] = 0.0
-        s[:, 0, n : 2 * n] = momentum
-        s[:, 1 + n : 1 + 2 * n, n : 2 * n] = momentum_covariance
+        s[:, 0, n : 2 * n] = mass @ (change / unit)
+        s[:, 1 + n : 1 + 2 * n, n : 2 * n] = (mass * wide) @ mass.T
         s[:, 1 + 2 * n :, 2 * n :] = np.diag(variance)
-        s[0, 1 + 2 * n :, 2 * n :] = np.diag(free_variance)
+        s[0, 1 + 2 * n :, 2 * n :] = np.diag(self.free) / (2.0 * self.decay)
         self.w[:] = contact / (self.filters - 1)
         self.w[0] = 1.0 - contact
         self.log_odds = log(contact)
@@ -175,11 +176,11 @@ cdef class Bank:
         """
         cdef Py_ssize_t j, k, n = self.joints, size = 3 * n, contacts = self.filters - 1
         cdef double begun = -expm1(-self.begin * h) * self.w[0], end = -expm1(-self.end * h)
-        cdef double touched = 1.0 - self.w[0], other = 0.0, stay, share
+        cdef double touched = 1.0 - self.w[0], other, stay, share
         cdef double* free = &self.s[0, 0, 0]
         cdef double* contact = &self.s[contacts + 1, 0, 0]
-        if contacts > 1:  # probability that contact goes on with one other intensity
-            other = (1.0 - end) * -expm1(-self.change * h) / (contacts - 1)
+        # Probability that contact goes on with one other intensity.
+        other = (1.0 - end) * -expm1(-self.change * h) / fmax(contacts - 1, 1.0)
         stay = 1.0 - end - contacts * other  # by how much likelier the same one is
         self.s[contacts + 1, :, :] = 0.0
         for j in range(contacts + 1):
