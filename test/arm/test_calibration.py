@@ -41,6 +41,10 @@ def found():
 def test_what_the_urdf_leaves_is_explained_also_in_another_motion_and_a_payload_is_found(found):
     assert np.all(found.after < 0.05 * found.before)
     assert not found.notes
+    np.testing.assert_allclose(found.calibration.torque_noise, 0.05, rtol=0.1)
+    np.testing.assert_allclose(found.calibration.position_noise, 1e-5, rtol=0.1)
+    rounded = np.round(np.sin(1e-3 * np.arange(10_000))[:, np.newaxis], 4)
+    assert 0.5 < noise_of(rounded)[0] / (1e-4 / np.sqrt(12.0)) < 2.0
     model, carried = ArmModel(URDF), [1.5, 0.02, 0.0, 0.35]
     other = recorded(seed=7, duration=20.0, payload=carried)
     _, by_urdf, _ = payload_of_motion(model, *other, Calibration.of_urdf(model))
@@ -54,13 +58,6 @@ def test_what_the_urdf_leaves_is_explained_also_in_another_motion_and_a_payload_
     assert np.all(after < 1.1 * before)
     with pytest.raises(ConfigurationError, match='at least 10 s of samples'):
         payload_of_motion(model, *(array[:1000] for array in other), found.calibration)
-
-
-def test_noise_is_found_and_stays_finite_for_a_quantised_encoder(found):
-    np.testing.assert_allclose(found.calibration.torque_noise, 0.05, rtol=0.1)
-    np.testing.assert_allclose(found.calibration.position_noise, 1e-5, rtol=0.1)
-    rounded = np.round(np.sin(1e-3 * np.arange(10_000))[:, np.newaxis], 4)
-    assert 0.5 < noise_of(rounded)[0] / (1e-4 / np.sqrt(12.0)) < 2.0
 
 
 def test_links_that_cannot_exist_are_not_found():
