@@ -117,8 +117,8 @@ def test_the_file_gives_back_what_was_written_and_others_are_refused(found):
 def test_commands_calibrate_find_a_payload_and_replay_a_bag(tmp_path, capsys):
     messages = [('/robot_description', TEXT, 1, files.serialise(TEXT, data=URDF))]
     for t, q, torque in zip(*recorded(duration=15.0), strict=True):
-        stamp = 10**9 + round(t * 1e9)
-        data = files.joint_state(stamp, q, JOINTS, torque)
+        stamp, set_back = 10**12 + round(t * 1e9), 10**11 * (t > 8.0)
+        data = files.joint_state(stamp - set_back, q, JOINTS, torque)
         messages.append(('/joint_states', files.JOINTS, stamp, data))
     bag = files.write(tmp_path / 'free', messages)
     file, table = tmp_path / 'three.yaml', tmp_path / 'torque.csv'

@@ -49,6 +49,9 @@ def _calibrate(arguments: argparse.Namespace, stop: Stop) -> None:
         arm = Arm(urdf, values | found_anew)
         stamps, rows = zip(*joint_samples(reader, arguments.topic, arm), strict=True)
         when, samples = np.array(stamps), np.array(rows)
+        steps = np.diff(when, prepend=when[0])
+        back = steps < -1e9 * identification.GAP  # a clock that is set back is a gap of a second
+        when += np.cumsum(np.where(back, 10**9 - steps, 0))
         newest = np.maximum.accumulate(np.concatenate([[0], when[:-1]]))
         good = np.isfinite(samples).all(axis=(1, 2)) & (when > newest)
         t = (when[good] - when[good][:1]) * 1e-9
