@@ -124,7 +124,7 @@ def test_commands_calibrate_find_a_payload_and_replay_a_bag(tmp_path, capsys):
     file, table = tmp_path / 'three.yaml', tmp_path / 'torque.csv'
     assert calibrate.main(['--bag', str(bag), '-o', str(file)]) == 0
     held_out = capsys.readouterr().out
-    wrong = ['-p', 'effort:=current', '-p', 'torque_constants:=[-1.0]']
+    wrong = ['-p', 'torque_constants:=[-1.0]']
     assert calibrate.main(['--bag', str(bag), '-o', str(file), *wrong]) == 2
     assert 'by the URDF alone, the efforts of all joints' in capsys.readouterr().err
     assert replay.main([str(bag), '-o', str(tmp_path / 'wrong.csv'), *wrong]) == 0

@@ -325,9 +325,7 @@ cdef inline void add_square(double* x, double share, Py_ssize_t size) noexcept n
         add(x + (i + 1) * size, share * x[i], x, size)
 
 
-cdef inline void advance(
-    double* y, Py_ssize_t count, double h, double stay
-) noexcept nogil:
+cdef inline void advance(double* y, Py_ssize_t count, double h, double stay) noexcept nogil:
     """Multiply by the transition: so many numbers that belong to Y, then to p and to d."""
     cdef double* p = y + count
     cdef double* d = p + count

@@ -235,9 +235,7 @@ cdef class Samples:
         self.h = self.clock.interval(self.h, self.moved, likely, self.found[1])
         self.vague = self.clock.vague if self.of_position else 0.0
         for k in range(n):
-            if fabs(self.moved[k]) > (
-                self.highest[2, k] * self.h + OFF * self.step[k]
-            ):
+            if fabs(self.moved[k]) > self.highest[2, k] * self.h + OFF * self.step[k]:
                 self.reset()
                 return 'jumped'
         self.learn_noise()

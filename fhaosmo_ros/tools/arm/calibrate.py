@@ -5,7 +5,6 @@ import argparse
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from fhaosmo_ros.core.arm import identification
 from fhaosmo_ros.core.arm.arm import Arm
@@ -56,25 +55,25 @@ def _calibrate(arguments: argparse.Namespace, stop: Stop) -> None:
         good = np.isfinite(samples).all(axis=(1, 2)) & (when > newest)
         t = (when[good] - when[good][:1]) * 1e-9
         q, effort, *velocity = samples[good].swapaxes(0, 1)
-        torque = effort
+        known, torque = arm.calibration, effort
+        given, usual = np.array(arm.parameters['torque_constants']), known.torque_constants
+        if arm.parameters['effort'] == 'current' and not arguments.payload:
+            usual = 0.0 * usual  # to be found
+        constants = np.where(given == 1.0, usual, given)
         if arm.parameters['effort'] == 'gravity_compensated':
-            torque = effort + np.array([arm.model.terms(row, 0.0 * row).gravity for row in q])
+            gravity = np.array([arm.model.terms(row, 0.0 * row).gravity for row in q])
+            torque = effort + gravity / constants
         if arguments.payload:
-            payload, *left = identification.payload_of_motion(
-                arm.model, t, q, torque, arm.calibration
-            )
+            known = replace(known, torque_constants=constants)
+            payload, *left = identification.payload_of_motion(arm.model, t, q, torque, known)
             print(_table(arm.joints, 'without', 'with payload', *left))
             numbers = ', '.join(f'{x:.4g}' for x in payload)
             print(f'\npayload: [{numbers}]    # kg and m, in the frame of {arm.joints[-1]}')
             return
-        constants: Any = 1.0
-        if arm.parameters['effort'] == 'current':
-            given = np.array(arm.parameters['torque_constants'])
-            constants = np.where(given == 1.0, 0.0, given)
         found = identification.identify(arm.model, t, q, torque, torque_constants=constants)
         # What the node says of this motion without calibration, of a wrong sign say.
-        given = {'torque_constants': found.calibration.torque_constants}
-        alone = Arm(urdf, values | found_anew | given)
+        told = {'torque_constants': found.calibration.torque_constants}
+        alone = Arm(urdf, values | found_anew | told)
         alone.run(t, q, effort, *velocity)
         if alone.doubts.text and not alone.doubts.mild:
             raise ConfigurationError(f'recording: by the URDF alone, {alone.doubts.text}')
