@@ -116,20 +116,21 @@ def test_the_file_gives_back_what_was_written_and_others_are_refused(found):
 
 def test_commands_calibrate_find_a_payload_and_replay_a_bag(tmp_path, capsys):
     messages = [('/robot_description', TEXT, 1, files.serialise(TEXT, data=URDF))]
-    for t, q, torque in zip(*recorded(duration=15.0), strict=True):
+    times, positions, torques = recorded(duration=15.0)
+    for t, q, torque in zip(times, positions, np.roll(torques, 5, axis=0), strict=True):
         stamp, set_back = 10**12 + round(t * 1e9), 10**11 * (t > 8.0)
         data = files.joint_state(stamp - set_back, q, JOINTS, torque)
         messages.append(('/joint_states', files.JOINTS, stamp, data))
     bag = files.write(tmp_path / 'free', messages)
-    file, table = tmp_path / 'three.yaml', tmp_path / 'torque.csv'
-    assert calibrate.main(['--bag', str(bag), '-o', str(file)]) == 0
+    file, table, late = tmp_path / 'three.yaml', tmp_path / 'torque.csv', 'torque_delay:=0.02'
+    assert calibrate.main(['--bag', str(bag), '-o', str(file), '-p', late]) == 0
     held_out = capsys.readouterr().out
     wrong = ['-p', 'torque_constants:=[-1.0]']
     assert calibrate.main(['--bag', str(bag), '-o', str(file), *wrong]) == 2
     assert 'by the URDF alone, the efforts of all joints' in capsys.readouterr().err
     assert replay.main([str(bag), '-o', str(tmp_path / 'wrong.csv'), *wrong]) == 0
     assert 'the efforts of all joints have the wrong sign' in capsys.readouterr().out
-    known = ['-p', f'calibration_file:={file}']
+    known = ['-p', f'calibration_file:={file}', '-p', late]
     assert calibrate.main(['--bag', str(bag), '--payload', *known]) == 0
     left = [
         [float(line.split()[column]) for line in said.splitlines() if line.startswith(JOINTS)]
