@@ -12,8 +12,10 @@ from copy import deepcopy
 import os
 from pathlib import Path
 from struct import Struct
+from textwrap import indent
 from typing import Any, NamedTuple
 
+from fhaosmo_ros.core.parameters.files import DUMPER
 from fhaosmo_ros.tools.bags.reader import BagReader, RECORD
 from fhaosmo_ros.tools.bags.types import learn, OFFERED_QOS, TYPES
 from mcap.data_stream import RecordBuilder
@@ -95,14 +97,14 @@ class BagWriter:
             self._schemas[message_type] = self._writer.register_schema(
                 message_type, 'ros2msg', text.encode()
             )
-        offered = yaml.safe_dump(list(qos))
+        offered = yaml.dump(list(qos), Dumper=DUMPER)
         metadata = {'offered_qos_profiles': offered, 'topic_type_hash': digest}
         self._channels[topic] = self._writer.register_channel(
             topic, 'cdr', self._schemas[message_type], metadata
         )
         self._topics.append({
             'name': topic, 'type': message_type, 'serialization_format': 'cdr',
-            'offered_qos_profiles': yaml.safe_load(offered),  # a copy: YAML refers to what it has
+            'offered_qos_profiles': deepcopy(list(qos)),  # YAML refers to what it has
             'type_description_hash': digest,
         })  # fmt: skip
         return known
@@ -175,10 +177,11 @@ class BagWriter:
             if kind:  # what has been flushed can be read
                 return
             self.flush()
-            text = yaml.safe_dump(information := self._information(), sort_keys=False)
+            information = self._information()
+            text = yaml.dump(information, Dumper=DUMPER, sort_keys=False)
             self._writer.add_metadata('rosbag2', {'serialized_metadata': text})
             self._writer.finish()
-        text = yaml.safe_dump({'rosbag2_bagfile_information': information}, sort_keys=False)
+        text = f'rosbag2_bagfile_information:\n{indent(text, "  ")}'
         part = self._path / 'metadata.part'
         part.write_text(text, encoding='utf-8')
         part.replace(self._path / 'metadata.yaml')
