@@ -88,12 +88,14 @@ def test_output_replaces_only_what_is_empty_or_forced_and_only_when_it_is_comple
         assert final.read_text() == text
     with suppress(Stopped), output_at(final, force=True) as path:
         path.write_text('half')
+        assert path.parent.name.startswith('out.')  # not hidden, as it stays after a kill
         raise Stopped
     assert final.read_text() == 'newer'
     with pytest.raises(ConfigurationError, match='--force'), output_at(final):
         pass
-    with pytest.raises(OSError, match=str(final)), output_at(final, force=True):
-        raise OSError(ENOSPC, 'No space left on device')
+    for given in (ENOSPC, 'No space'), ('No space',):  # some libraries give no number
+        with pytest.raises(OSError, match=f'No space.*{final}'), output_at(final, force=True):
+            raise OSError(*given)
     assert [p.name for p in tmp_path.iterdir()] == ['out']
     for place, inputs, why in (Path('..'), [], 'in use'), (tmp_path, [final], 'the input'):
         with pytest.raises(ConfigurationError, match=why), output_at(place, True, *inputs):

@@ -227,7 +227,7 @@ def test_ctrl_c_ends_early_with_a_report_and_without_a_trace(tmp_path):
     process = start('demo', '--duration', 600, '--output', folder, **APART)
 
     def count():
-        return sum(len(stamps(b, '/estimator/state')) for b in tmp_path.glob('.out.*/out/bag'))
+        return sum(len(stamps(b, '/estimator/state')) for b in tmp_path.glob('out.*/out/bag'))
 
     wait_until(lambda: count() > 100, 'estimates', 120.0, process)
     # As a terminal does: to the whole group; and twice, as an impatient user does.

@@ -102,9 +102,10 @@ def output_at(final: Path, force: bool = False, *inputs: Path) -> Iterator[Path]
     Yield where to write a file or folder meanwhile, and move it to its place once complete.
 
     It is complete when the block ends without an error; else nothing stays, and what was there
-    before does. The path that is yielded has the final name, in a hidden folder beside its place,
-    and does not exist yet. ConfigurationError if the place is in use, unless `force`: by a file,
-    or a folder that is not empty; `force` or not, by one of the inputs, or a part of one.
+    before does; but a kill leaves the folder NAME.*.part beside the place. The path that is
+    yielded has the final name, in that folder, and does not exist yet. ConfigurationError if the
+    place is in use, unless `force`: by a file, or a folder that is not empty; `force` or not, by
+    one of the inputs, or a part of one.
     """
     if final.name in ('', '..'):  # nothing could be renamed to it
         raise ConfigurationError(f'output {final}: expected a name, got a folder that is in use')
@@ -126,7 +127,7 @@ def output_at(final: Path, force: bool = False, *inputs: Path) -> Iterator[Path]
     expect_free()
     final.parent.mkdir(parents=True, exist_ok=True)
     folder = TemporaryDirectory(
-        prefix=f'.{final.name}.', suffix='.part', dir=final.parent, ignore_cleanup_errors=True
+        prefix=f'{final.name}.', suffix='.part', dir=final.parent, ignore_cleanup_errors=True
     )
     with folder as name:
         written = Path(name, final.name)
@@ -138,7 +139,8 @@ def output_at(final: Path, force: bool = False, *inputs: Path) -> Iterator[Path]
             written.rename(final)
         except OSError as error:
             if error.filename is None:  # of a write, such as to a disk that is full
-                raise OSError(error.errno, error.strerror, str(final)) from None
+                text = error.strerror or str(error)
+                raise OSError(error.errno, text, str(final)) from None
             raise
 
 
