@@ -23,9 +23,10 @@ def test_file_of_parameters(kind, tmp_path):
     assert all(found[name] == GAINS[name] for name in found.keys() & GAINS.keys())
     assert ('divergence_time' in found) == (kind is OnlineEstimator)
     path.write_text(dumps(GAINS | {'channels': ['hip'], 'hip.constants.k': 3.0}, '/rig/observer'))
-    assert kind.from_yaml(path, '/rig/observer', 'hip').parameters['constants.k'] == 3.0
-    with pytest.raises(ConfigurationError, match=r'gains\.yaml: .*hip, got none'):
-        kind.from_yaml(path, '/rig/observer')
+    for name in ('hip', ''):  # a single one need not be named
+        assert kind.from_yaml(path, '/rig/observer', name).parameters['constants.k'] == 3.0
+    with pytest.raises(ConfigurationError, match=r'gains\.yaml: .*hip, got hop'):
+        kind.from_yaml(path, '/rig/observer', 'hop')
     with pytest.raises(ConfigurationError, match=r"gains\.yaml: expected a section 'estimator'"):
         kind.from_yaml(path)
 

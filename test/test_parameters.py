@@ -155,6 +155,8 @@ def test_one_file_serves_channels_and_plant_and_a_replay_takes_one_channel(tmp_p
     assert replayed(*words, '--channel', 'knee') == default | {'epsilon': 5.0, 'lambda': [3.0]}
     with pytest.raises(ConfigurationError, match='--channel: expected hip or knee, got none'):
         replayed(*words)
+    with pytest.raises(ConfigurationError, match='--channel: expected the name of a joint'):
+        replayed('-p', 'channels:=from_joint_names')
     with pytest.raises(ConfigurationError, match=r'--channel: expected none, .* got hip'):
         replayed('--channel', 'hip')
 

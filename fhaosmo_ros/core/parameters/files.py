@@ -83,12 +83,12 @@ def make_from_file(
     """
     Return what `make` makes of the parameters that a file sets for a channel of an estimator.
 
-    The channel of a node that has a single one is called ''. Raises ConfigurationError as `load`
+    '' stands for the channel of a node that has a single one. Raises ConfigurationError as `load`
     and `make`, for a file without a section of the node, or without the channel.
     """
     values = load(path, node, NODE_TABLES['estimator'], strict=True)
     try:
-        return make(of_named_channel(values, channel, 'channel'))
+        return make(of_named_channel(values, channel, 'channel')[1])
     except ConfigurationError as error:
         raise ConfigurationError(f'{path}: {error}') from None
 

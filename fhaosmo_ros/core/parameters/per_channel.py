@@ -132,13 +132,22 @@ def of_channel(values: Mapping[str, Any], name: str) -> Parameters:
     return Parameters(ESTIMATOR_PARAMETERS, common | own)
 
 
-def of_named_channel(values: Mapping[str, Any], name: str, what: str) -> Parameters:
-    """Return the parameters of a channel that a user named; raise of `what` if there is none."""
+def of_named_channel(
+    values: Mapping[str, Any], name: str, what: str
+) -> tuple[str, Parameters]:
+    """
+    Return name and parameters of a channel that a user named; a single one need not be named.
+
+    Raises ConfigurationError of `what` if there is none.
+    """
     names = channel_names(values)
+    if not name and len(names) == 1 and names != FROM_JOINTS:
+        (name,) = names
     if name not in names and (names != FROM_JOINTS or not name):
-        allowed = 'none, as the node has no channels' if names == UNNAMED else ' or '.join(names)
+        words = {'': 'none, as the node has no channels', FROM_JOINTS[0]: 'the name of a joint'}
+        allowed = ' or '.join(words.get(known, known) for known in names)
         raise ConfigurationError(f'{what}: expected {allowed}, got {name or "none"}')
-    return of_channel(values, name)
+    return name, of_channel(values, name)
 
 
 def differing(values: Parameters) -> dict[str, Any]:

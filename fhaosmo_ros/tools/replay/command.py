@@ -115,7 +115,8 @@ def make_estimator(
         values = select(values, ESTIMATOR_PARAMETERS)
     except ConfigurationError as error:
         raise with_origin(error, origins) from None
-    own = of_named_channel(with_joints(values), arguments.channel, '--channel')
+    named = of_named_channel(with_joints(values), arguments.channel, '--channel')
+    arguments.channel, own = named
     parameters = CHANNEL_PARAMETERS.complete(own)
     if arguments.bag.suffix == '.csv':  # it says where y and u are, not the topics of a node
         parameters = parameters.changed(ParameterTable(INPUT).defaults())

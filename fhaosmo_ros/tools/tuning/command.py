@@ -146,7 +146,7 @@ def _of_search(
 def _of_bag(path: Path, channel: str, estimator: dict[str, Any], tuning: dict[str, Any]) -> Found:
     """Find the gains for what the y of a bag shows."""
     values = with_joints(estimator)
-    own = of_named_channel(values, channel, '--channel')
+    channel, own = of_named_channel(values, channel, '--channel')
     given = {name.removeprefix(f'{channel}.') for name in values}
     estimator = {name: value for name, value in own.items() if name in given}
     if channel:
