@@ -132,9 +132,7 @@ def of_channel(values: Mapping[str, Any], name: str) -> Parameters:
     return Parameters(ESTIMATOR_PARAMETERS, common | own)
 
 
-def of_named_channel(
-    values: Mapping[str, Any], name: str, what: str
-) -> tuple[str, Parameters]:
+def of_named_channel(values: Mapping[str, Any], name: str, what: str) -> tuple[str, Parameters]:
     """
     Return name and parameters of a channel that a user named; a single one need not be named.
 

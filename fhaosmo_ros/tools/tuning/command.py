@@ -138,9 +138,13 @@ def _of_search(
         rows.append([f'RMS error of {name}', *(f'{error:.3g}' for error in of_name)])
     text = (
         f'{finished(study)} trials on {len(training)} simulated recordings; '
-        f'{len(held_out)} others, held out, took no part in the search.'
+        f'{len(held_out)} others, held out, took no part in the search.\n\n'
+        f'{markdown(columns, rows)}'
     )
-    return tuned, f'{text}\n\n{markdown(columns, rows)}'
+    if not values['noise_std'] and not values['quantisation']:
+        text += '\n\nNote: these gains are for a y without noise. If yours has some, say by '
+        text += 'noise_std how large (its standard deviation), and tune again.'
+    return tuned, text
 
 
 def _of_bag(path: Path, channel: str, estimator: dict[str, Any], tuning: dict[str, Any]) -> Found:
