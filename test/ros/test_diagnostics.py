@@ -36,7 +36,7 @@ def test_values_of_the_reports(pair):
 
 
 @pytest.mark.parametrize(('who', 'words'), [
-    ('source', 'jitter'), ('process', 'after their stamps'),
+    ('source', 'sampling to nominal and nominal_period to 0.'), ('process', 'after their stamps'),
 ])  # fmt: skip
 def test_a_process_that_stands_still_for_a_moment_is_told(pair, who, words):
     process = getattr(pair, who)

@@ -138,7 +138,9 @@ class Health:
         spread = news['spread stamps']
         ticks = f'/clock ticks once for {used / max(1, used - spread):.0f} samples'
         report.find(WARN, ticks, used < 2 * spread)
-        report.find(WARN, f'jitter {jitter:.3g}', jitter > JITTER)
+        uneven = f'intervals between samples differ by {jitter:.3g} of their mean: if the sensor '
+        uneven += f'samples evenly, set sampling to nominal and nominal_period to {period:.4g}'
+        report.find(WARN, uneven, jitter > JITTER and limits['sampling'] != 'nominal')
         report.find(WARN, f'samples arrive {delay:.3g} s after their stamps', delay > DELAY)
         side = 'before' if offset > 0.0 else 'after'
         apart = f'header stamps lie {abs(offset):.3g} s {side} publication'
