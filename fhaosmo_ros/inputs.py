@@ -8,6 +8,7 @@ lists ``known_input_topics`` and so on.
 
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
+import warnings
 
 from fhaosmo_ros.core.parameters.per_channel import channel_names, FROM_JOINTS
 from fhaosmo_ros.core.parameters.tables import CHANNEL_PARAMETERS
@@ -54,12 +55,19 @@ def known_inputs(
     """
     Return what the known inputs are that the model uses, by their `names` in it; else as for y.
 
-    Raises ConfigurationError for a list with neither one entry nor one for each of them.
+    Warns of what is said of known inputs of a model without any. Raises ConfigurationError for a
+    list with neither one entry nor one for each of them.
     """
     columns = []
     for part in PARTS:
         declared = CHANNEL_PARAMETERS[f'known_input_{part}s']
         given: list[str] = values[declared.name]
+        if not names and given != declared.default:
+            where = f'channel {channel}: ' if channel else ''
+            warnings.warn(
+                f"{where}'{declared.name}' is not used: phi has no known input", stacklevel=2
+            )
+            continue
         if len(given) not in (1, len(names)):
             listed = ', '.join(names)
             raise declared.error(
