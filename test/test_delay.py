@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A known delay of y: the inputs that acted then, the estimate's time, and the present."""
 
-from fhaosmo_ros.core import ConfigurationError, Family, Observer, OnlineEstimator
+from fhaosmo_ros.core import Family, Observer, OnlineEstimator
 from fhaosmo_ros.core.simulation.plant import respond
 from hypothesis import given
 from hypothesis import strategies as st
@@ -130,11 +130,6 @@ def test_more_pieces_than_there_is_room_for_lose_the_oldest():
         found = acting(pieces, 10 * (back + 1), 10, now)
         np.testing.assert_array_equal(found, [newest, -newest])
     np.testing.assert_array_equal(acting(pieces, 10 * count, 10, now)[0], count - 512)
-
-
-def test_input_later_than_y_is_refused():
-    with pytest.raises(ConfigurationError, match='input_delay'):
-        OnlineEstimator(DELAYED | {'input_delay': 0.05})
 
 
 def test_recordings_have_the_delay():

@@ -2,7 +2,7 @@
 """Events: what begins and ends one, by every way of running, in bags, in tables and in figures."""
 
 import bag_files as files
-from fhaosmo_ros.core import ConfigurationError, EventDetector, OnlineEstimator
+from fhaosmo_ros.core import EventDetector, OnlineEstimator
 from fhaosmo_ros.core.observer.estimates import TUNING
 from fhaosmo_ros.core.observer.status import Status
 from fhaosmo_ros.tools import plot
@@ -142,13 +142,6 @@ def test_a_reset_ends_an_event_and_so_does_switching_off(samples):
     assert not estimator.events.active
     estimator.run(stamps[1400:], y[1400:])
     assert [e.begins for e in estimator.events.taken()] == [True, False]
-
-
-def test_standard_deviations_that_nobody_knows_are_refused():
-    estimator = OnlineEstimator()
-    with pytest.raises(ConfigurationError, match=r"'event_deviations'.*self_tuning.*'fixed'"):
-        estimator.configure({'event_deviations': 4.0})
-    assert estimator.parameters['event_deviations'] == 0.0
 
 
 def test_bag_tables_and_figure_have_what_the_node_finds(samples, tmp_path, monkeypatch):

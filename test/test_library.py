@@ -58,16 +58,12 @@ def test_keywords_are_parameters(kind):
         assert word in repr(found)
 
 
-def test_input_that_phi_uses_must_be_given():
-    observer = Observer(OSCILLATOR)
+def test_input_that_phi_uses_must_be_given_and_seconds_are_no_stamps():
+    observer, estimator = Observer(OSCILLATOR), OnlineEstimator(GAINS)
     for call, *values in (observer.run, T, Y), (observer.smooth, T, Y), (observer.step, 0.1, 0.1):
         with pytest.raises(ConfigurationError, match='expected values of u'):
             call(*values)
     assert not observer.started
-
-
-def test_seconds_are_no_stamps():
-    estimator = OnlineEstimator(GAINS)
     with pytest.raises(TypeError, match='integer'):
         estimator.update(0.001, 0.1)
     with pytest.raises(ConfigurationError, match='nanoseconds'):

@@ -137,6 +137,9 @@ def fed(count, **parameters):
 @pytest.mark.parametrize('integer', [0, -1, 2**63 - 1, -(2**63), 1_700_000_000_123_456_789])
 def test_labels_name_what_stands_there_and_integers_come_back_exactly(integer):
     estimator = fed(700)
+    own, events = estimator.policy.memory, vars(estimator.events.memory)
+    names = ['version', *estimator.observer.structure.state_dict(), *own, *events]
+    assert sorted(estimator.state_dict()) == sorted(names)  # none twice
     times = ('stamp', 'latest', 'now', 'held_stamp', 'seen', 'tick', 'placed', 'event_since')
     state = estimator.state_dict() | dict.fromkeys(times, integer)
     labels, vector = pack(Flag.RESET, state)
@@ -146,13 +149,6 @@ def test_labels_name_what_stands_there_and_integers_come_back_exactly(integer):
     assert (snapshot.stamp, snapshot.flags) == (integer, Flag.RESET)
     other.load_state_dict(snapshot.values)
     np.testing.assert_equal(other.state_dict(), state)
-
-
-def test_what_an_estimator_remembers_has_names_of_its_own():
-    estimator = OnlineEstimator(gains='self_tuning', **SECOND)
-    own, events = estimator.policy.memory, vars(estimator.events.memory)
-    names = ['version', *estimator.observer.structure.state_dict(), *own, *events]
-    assert sorted(estimator.state_dict()) == sorted(names)
 
 
 LATE = {'gains': 'fixed', 'measurement_delay': 0.1, 'phi': ['u', '0', '0']}

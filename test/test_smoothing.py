@@ -271,10 +271,6 @@ def test_known_inputs_and_a_nonlinear_model():
 def test_what_is_missing_is_told_in_one_line():
     with pytest.raises(ConfigurationError, match=r"expected 'noise_size' > 0.*got 0 and true"):
         Observer().smooth(np.arange(9.0), np.zeros(9))
-    with pytest.raises(ConfigurationError, match="'noise_size'"):
-        OnlineEstimator({'smoothing_lag': 0.1})
-    with pytest.raises(ConfigurationError, match='past or of the present'):
-        online(smoothing_lag=0.1, predict_to_now=True)
     estimator = online(smoothing_lag=0.1)
     with pytest.raises(ConfigurationError, match="'noise_size'"):
         estimator.configure({'noise_size': 0.0})

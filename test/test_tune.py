@@ -220,11 +220,8 @@ def test_minimum_is_found_from_the_start_on_as_the_seed_says():
     assert [value == study.best_value for value in values] == [True, False]
 
 
-def test_values_that_are_not_finite_are_bad_not_fatal():
+def test_values_that_are_not_finite_are_bad_and_a_missing_package_is_named(monkeypatch):
     assert minimise(lambda v: float('nan'), SPACE, 5).best_value == BAD
-
-
-def test_missing_package_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, 'optuna', None)
     with pytest.raises(ConfigurationError, match=r"pip install 'optuna>=4,<6' cmaes"):
         minimise(bowl, SPACE, 1)
