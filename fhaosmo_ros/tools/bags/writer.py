@@ -29,12 +29,11 @@ import yaml
 
 CHUNK_SIZE = 1 << 20
 """Bytes of messages after which a chunk of mcap is closed."""
-HEAD = (
-    ('opcode', 'u1'), ('length', '<u8'), ('channel', '<u2'), ('sequence', '<u4'),
-    ('stamp', '<u8'), ('published', '<u8'),
-)  # fmt: skip
-"""What stands in front of a message in CDR: the head of a record, and that of a message."""
-PACKED_HEAD = Struct('<BQHIQQ')
+HEAD, TIMES = Struct('<BQHIQQ'), slice(15, 31)
+"""
+What stands in front of a message in CDR: the head of a record, and that of a message, which ends
+with log time and publish time.
+"""
 
 
 class _Index(NamedTuple):
@@ -112,9 +111,9 @@ class BagWriter:
     def write(self, topic: str, stamp: int, data: bytes, published: int | None = None) -> None:
         """Append a message in CDR, with stamp and publish time (by default the stamp) in ns."""
         channel, sent = self._channels[topic], stamp if published is None else published
-        size = PACKED_HEAD.size - RECORD.size + len(data)
+        size = HEAD.size - RECORD.size + len(data)
         self._rows.append((channel, stamp, len(self._data)))
-        self._data += PACKED_HEAD.pack(Opcode.MESSAGE, size, channel, 0, stamp, sent) + data
+        self._data += HEAD.pack(Opcode.MESSAGE, size, channel, 0, stamp, sent) + data
         if len(self._data) > CHUNK_SIZE:
             self.flush()
 
@@ -128,16 +127,15 @@ class BagWriter:
         each time: an array of (K,) or (K, m).
         """
         self.flush()
-        begin = message[: len(message) - numbers[:1].nbytes]
-        of_numbers = 'numbers', numbers.dtype, numbers.shape[1:]
-        records = np.zeros(len(times), [*HEAD, ('begin', f'V{len(begin)}'), of_numbers])
-        records['opcode'], records['channel'] = Opcode.MESSAGE, self._channels[topic]
-        records['length'] = records.itemsize - RECORD.size
-        records['stamp'] = records['published'] = times
-        records['begin'] = np.void(begin)
-        records['numbers'] = numbers
-        places = records.itemsize * np.arange(len(times))
-        self._write_chunk(records.tobytes(), np.column_stack([records['channel'], times, places]))
+        channel, size = self._channels[topic], HEAD.size - RECORD.size + len(message)
+        record = HEAD.pack(Opcode.MESSAGE, size, channel, 0, 0, 0) + message
+        records = np.tile(np.frombuffer(record, np.uint8), (len(times), 1))
+        records[:, TIMES] = np.column_stack([times, times]).view(np.uint8)
+        its_own = np.ascontiguousarray(numbers).view(np.uint8).reshape(len(times), -1)
+        records[:, -its_own.shape[1] :] = its_own
+        places = len(record) * np.arange(len(times))
+        rows = np.column_stack([np.full(len(times), channel), times, places])
+        self._write_chunk(records.tobytes(), rows)
 
     def _write_chunk(self, data: bytes, rows: NDArray[np.int64]) -> None:
         """Write message records as a chunk: what `Writer.add_message` does for each of them."""
