@@ -176,7 +176,7 @@ def test_bag_tables_and_figure_have_what_the_node_finds(samples, tmp_path, monke
             for _, _, m in reader.read_all(['/estimator/event'])
         ]
     assert told == [(e.stamp, e.begins) for e in events]
-    (curves,) = read_curves(bag, None, '/plant')
+    (curves,) = read_curves(bag, [], '/plant')
     np.testing.assert_array_equal(curves.deviation, found[:, 8:])
     assert curves.events[0] == (events[0].since, events[1].stamp)
     bands, shaded = [], []

@@ -49,7 +49,7 @@ def _bag(tmp_path_factory):
 
 
 def test_truth_is_unknown_where_the_bag_lacks_it(bag, tmp_path, capsys):
-    (curves,) = read_curves(bag, None, '/plant')
+    (curves,) = read_curves(bag, [], '/plant')
     known = np.isfinite(curves.truth).all(axis=1)
     assert known.tolist() == [k in KNOWN for k in range(FIRST, COUNT)]
     assert plot.main([str(bag), '-o', str(tmp_path / 'figure.pdf')]) == 0

@@ -58,8 +58,9 @@ def _plot(arguments: argparse.Namespace, stop: Stop) -> None:
             f'--output: expected a name that ends in {", ".join(SUFFIXES)}, got {path}'
         )
     with stop.raising():
-        plant = arguments.plant or '/plant'
-        curves = [c for bag in arguments.bags for c in read_curves(bag, arguments.names, plant)]
+        plant = f'/{(arguments.plant or "plant").strip("/")}'
+        names = [f'/{name.strip("/")}' for name in arguments.names or ()]
+        curves = [c for bag in arguments.bags for c in read_curves(bag, names, plant)]
     if arguments.plant and all(c.truth is None for c in curves):
         of_truth = ', '.join(f'{plant}/{part}' for part in TRUTH)
         raise ConfigurationError(f'--plant: expected a bag with {of_truth}, got none')
@@ -91,12 +92,12 @@ class Curves(NamedTuple):
         return self._replace(**{name: array[rows] for name, array in arrays.items()})
 
 
-def read_curves(path: Path, names: list[str] | None, plant: str) -> list[Curves]:
+def read_curves(path: Path, names: Sequence[str], plant: str) -> list[Curves]:
     """Read the estimates of some estimators, or of all that a bag holds, at least one."""
     with BagReader(path) as reader:
         first, *others = map(reader.names_above, ESTIMATES)
         found = [name for name in first if all(name in other for other in others)]
-        if not found or not set(names or ()) <= set(found):
+        if not found or not set(names) <= set(found):
             raise ConfigurationError(
                 f'bag {path}: expected estimates (topics {", ".join(ESTIMATES)}, which replay '
                 f'adds) of {", ".join(names or ["an estimator"])}, got those of '
