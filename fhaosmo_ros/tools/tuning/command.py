@@ -61,7 +61,14 @@ def main(argv: list[str] | None = None) -> int:
         '--trials', type=int, default=1000, metavar='N',
         help='that the study shall hold at the end (default: %(default)s)',
     )  # fmt: skip
-    add('--jobs', type=int, metavar='N', help='trials at a time (default: one a core)')
+    cores = os.cpu_count() or 1
+    add(
+        '--jobs',
+        type=int,
+        default=cores,
+        metavar='N',
+        help='trials at a time (default: %(default)s)',
+    )
     add('--seed', type=int, default=1, help='of recordings and search (default: %(default)s)')
     add(
         '--storage', metavar='URL',
@@ -72,7 +79,7 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _tune(arguments: argparse.Namespace, stop: Stop) -> None:
-    if arguments.trials < 1 or (arguments.jobs or 1) < 1 or arguments.seed < 0:
+    if arguments.trials < 1 or arguments.jobs < 1 or arguments.seed < 0:
         raise ConfigurationError(
             'expected --trials >= 1, --jobs >= 1 and --seed >= 0, got '
             f'{arguments.trials}, {arguments.jobs} and {arguments.seed}'
@@ -124,8 +131,7 @@ def _of_search(
         training, held_out = simulated(values, arguments.seed)
         print(f'{len(training)} recordings to train on, {len(held_out)} held out')
         tuner = Tuner(training, estimator, values, arguments.seed)
-    jobs = arguments.jobs or os.cpu_count() or 1
-    study = tuner.search(arguments.trials, jobs, arguments.storage, stop.is_set)
+    study = tuner.search(arguments.trials, arguments.jobs, arguments.storage, stop.is_set)
     start = tuner.parameters({d.name: d.start for d in tuner.space})
     tuned = tuner.parameters(study.best_params)
     columns, found = [''], []
