@@ -30,6 +30,7 @@ WRONG = {
     f'{TABLE} late.csv --columns t,u': ['t, angle, u: of the time, y, torque, got t, u'],
     f'{TABLE} late.csv --columns t,anlge,u': ['t, angle, u: of', 'got t, anlge, u'],
     f'{TABLE} late.csv': ['late.csv: expected times of 0 to 9.2e+09 s, got nan in sample 0'],
+    'replay nan.csv': ["'/y': expected samples that can be used, got rejected_measurements 2"],
     # Parameters.
     'replay bag -p input_topic:=/yy': ["'/yy'", '(/y)', "did you mean '/y'?"],
     'replay bag -p input_field:=date': ["'date'", "did you mean 'data'?"],
@@ -41,9 +42,9 @@ WRONG = {
     'replay bag --params-file lamda.yaml': ['error: lamda.yaml: ', "'lamda'", "mean 'lambda'"],
     'replay bag --params-file node.yaml': ["'estimator' or '/**'", 'got estimater'],
     # plot
-    'plot both --plant /no': ['--plant: expected a bag with /no/state, /no/unknown_input'],
+    'plot both --plant no': ['--plant: expected a bag with /no/state, /no/unknown_input'],
     'plot both -o x.jpg': ['.png, .svg, .pdf', 'x.jpg'],
-    'plot both --names /no': ['of /no, got those of /estimator'],
+    'plot both --names no': ['of /no, got those of /estimator'],
     'plot bag': ['of an estimator, got those of none', 'replay'],
     # arm
     'calibrate --bag joints --payload': ['calibration_file:=FILE'],
@@ -68,6 +69,7 @@ WRONG = {
     f'{TUNE} -pphi:=[0,0,z3**3] -prms_of_d:=100.0': ['expected states that stay finite'],
     f'{TUNE} -psettled:=4.0': ['more than 4 s'],
     f'{TUNE} --trials=0': ['--trials >= 1'],
+    f'{TUNE} --jobs=0': ['--jobs >= 1'],
     f'{TUNE} --storage nodb://x': ['storage'],
     f'{TUNE} -o /proc/no/out': ['No such file or directory: /proc/no'],
     f'{TUNE} -o bag': ['expected a new name (or --force'],
@@ -99,6 +101,7 @@ def place(tmp_path_factory):
     (place / 'text.csv').write_bytes(b't,y,u\n0,1,2\n0.001,\xff,3\n')
     (place / 'late.csv').write_text('t,angle,u\nnan,1,2\n')
     (place / 'none.csv').touch()
+    (place / 'nan.csv').write_text('t,y\n0,\n1,\n')
     (place / 'lamda.yaml').write_text('estimator: {ros__parameters: {lamda: 1.0}}')
     (place / 'node.yaml').write_text('estimater: {ros__parameters: {}}')
     text = shipped('config/demo.yaml').read_text()

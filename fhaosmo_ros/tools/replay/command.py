@@ -188,11 +188,19 @@ def _replay(arguments: argparse.Namespace, stop: Stop) -> None:
             for rows in _estimates(estimator, live, samples, u, arguments.smooth):
                 for write in sinks:
                     write(rows)
-    c = estimator.counters
+            c = estimator.counters
+            counts = {name: n for name, n in c._asdict().items() if n and name != 'accepted'}
+            told = ', '.join(f'{name} {n}' for name, n in counts.items())
+            if c.rejected and not c.accepted:
+                raise ConfigurationError(
+                    f'topic {inputs.y.topic!r}: expected samples that can be used, got {told}'
+                )
     print(
         f'{c.accepted} samples used, {c.rejected} rejected, {c.restarts} restarts; '
         f'{span:.1f} s of data in {perf_counter() - started:.2f} s'
     )
+    if told:
+        print(f'counters: {told}')
     for why, count in reader.lacking.items():
         print(f'{count} messages left out: {why}')
     print(f'stamps: {stamps}')
