@@ -265,7 +265,7 @@ def test_hostile_text_is_content_or_one_line(name):
         assert reason.startswith('expected YAML, got: ')
         assert REASONS[name] in reason
     assert refusal_of(ESTIMATOR_PARAMETERS['lambda'].coerce, text)
-    refusal_of(ESTIMATOR_PARAMETERS.coerce, values_of([f'lambda:={text}']))
+    refusal_of(lambda: ESTIMATOR_PARAMETERS.coerce(values_of([f'lambda:={text}'])))
     for whole in (text, setting(f'lambda: {text}')):
         assert refusal_of(loads, whole, 'estimator', ESTIMATOR_PARAMETERS)
 

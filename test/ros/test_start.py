@@ -39,7 +39,7 @@ REFUSED = [
     # Arguments.
     (E, rules(f'lambda:={HOSTILE["50000 brackets"]}'), ["'lambda'"]),
     (E, rules('estimator:noise:=0.1'), ["'noise'"]),
-    (E, rules('epsilon'), ["'-p epsilon'"]),
+    (E, rules('epsilon'), ["-p: expected NAME:=VALUE, got 'epsilon'"]),
     (P, rules('use_sim_time:=1'), ["'use_sim_time': expected true or false, got 1"]),
     (P, ['fast'], ["'fast'", 'usage: plant']),
     (P, ['-p', 'order:=3'], ["'-p'", '--ros-args']),

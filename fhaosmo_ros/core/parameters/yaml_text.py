@@ -97,6 +97,17 @@ def parse(text: str) -> Any:
     raise ConfigurationError(f'expected YAML, got: {problem}')
 
 
+def parse_rule(rule: str) -> tuple[str, Any]:
+    """Return name and value of a command line's rule NAME:=VALUE; raise as `parse`."""
+    name, separator, text = rule.partition(':=')
+    if not (separator and name):
+        raise ConfigurationError(f'-p: expected NAME:=VALUE, got {rule!r}')
+    try:
+        return name, parse(text)
+    except ConfigurationError as error:
+        raise ConfigurationError(f"parameter '{name}': {error}") from None
+
+
 def _check(text: str) -> None:
     """Refuse what is too large, or not read by ROS, before anything is made of it."""
     values = depth = 0

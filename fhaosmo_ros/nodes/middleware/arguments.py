@@ -13,7 +13,7 @@ from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.files import read
 from fhaosmo_ros.core.parameters.per_channel import is_built_in
 from fhaosmo_ros.core.parameters.tables import NODE_TABLES
-from fhaosmo_ros.core.parameters.yaml_text import parse
+from fhaosmo_ros.core.parameters.yaml_text import parse_rule
 from rclpy.logging import get_logger
 from rclpy.utilities import remove_ros_args
 
@@ -49,20 +49,15 @@ def read_arguments(name: str, argv: list[str]) -> tuple[dict[str, Any], Origins,
         given |= values
         origins |= dict.fromkeys(values, path)
     for rule in found.param:
-        target, separator, text = rule.partition(':=')
+        target, value = parse_rule(rule)
         node, _, parameter = target.rpartition(':')
-        if not (separator and parameter):
-            raise ConfigurationError(f"expected -p NAME:=VALUE, got '-p {rule}'")
         if node and node != full_name.rsplit('/', 1)[-1]:
             continue  # one command line may serve several nodes
         # A file may hold the parameters of another node of the package, too; a rule may not.
         table = NODE_TABLES[name]
         if not (is_built_in(parameter) or '.' in parameter or parameter in table):
             raise unknown_parameter(parameter, table)
-        try:
-            given[parameter], origins[parameter] = parse(text), None
-        except ConfigurationError as error:
-            raise ConfigurationError(f"parameter '{parameter}': {error}") from None
+        given[parameter], origins[parameter] = value, None
     others = remove_ros_args([name, *(rest if of_ros else argv)])[1:]
     if others:
         raise ConfigurationError(

@@ -15,7 +15,7 @@ from typing import Any
 
 from fhaosmo_ros import __version__
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
-from fhaosmo_ros.core.parameters.yaml_text import parse
+from fhaosmo_ros.core.parameters.yaml_text import parse_rule
 from fhaosmo_ros.stop_signals import Stop, stop_on_signals, Stopped
 from tqdm import tqdm
 
@@ -84,16 +84,7 @@ def add_value_options(parser: argparse.ArgumentParser, which: str) -> None:
 
 def values_of(rules: Sequence[str]) -> dict[str, Any]:
     """Return the values that rules NAME:=VALUE set."""
-    values = {}
-    for rule in rules:
-        name, separator, text = rule.partition(':=')
-        if not separator:
-            raise ConfigurationError(f'-p: expected NAME:=VALUE, got {rule!r}')
-        try:
-            values[name] = parse(text)
-        except ConfigurationError:
-            values[name] = text
-    return values
+    return dict(map(parse_rule, rules))
 
 
 @contextmanager
