@@ -150,7 +150,7 @@ def test_command_says_what_a_bag_shows_or_that_it_can_give_no_gains(tmp_path, ca
     bag, out = files.write(tmp_path / 'bag', files.floats(stamps, r.y)), tmp_path / 'out'
     path = tmp_path / 'p.yaml'
     path.write_text(
-        '/**: {ros__parameters: {channels: [hip, elbow], input_topic: /y, gains: self_tuning, '
+        '/**: {ros__parameters: {channels: [hip, elbow], input_topic: /y, hip.gains: self_tuning, '
         "hip.lambda: [1.0], elbow.phi: ['0', '0', '0']}}"
     )
     command = [f'--bag={bag}', f'-o{out}', f'--params-file={path}', '--channel=hip']

@@ -159,6 +159,7 @@ def _of_bag(path: Path, channel: str, estimator: dict[str, Any], tuning: dict[st
     channel, own = of_named_channel(values, channel, '--channel')
     given = {name.removeprefix(f'{channel}.') for name in values}
     estimator = {name: value for name, value in own.items() if name in given}
+    estimator['gains'] = 'fixed'  # also where the channel tunes itself
     if channel:
         estimator['channels'] = [channel]
     if others := chosen_otherwise(estimator):
