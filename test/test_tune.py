@@ -143,10 +143,13 @@ def test_estimator_loads_the_output_and_the_next_tuning_begins_there(arguments, 
     assert values.keys() == load(out / 'gains.yaml', 'estimator').keys()
 
 
-@pytest.mark.parametrize('section', ['/**', 'estimator', 'plant', 'tune'])
-def test_model_may_stand_in_any_section(tmp_path, section):
+@pytest.mark.parametrize(('section', 'model'), [
+    *((name, "order: 1, phi: ['-2.0*z1']") for name in ('/**', 'estimator', 'plant', 'tune')),
+    ('estimator', "channels: [hip], hip: {order: 1, phi: ['-2.0*z1'], gains: self_tuning}"),
+])  # fmt: skip
+def test_model_may_stand_in_any_section_or_be_a_channels(tmp_path, section, model):
     path = tmp_path / 'model.yaml'
-    path.write_text(f"{section}: {{ros__parameters: {{order: 1, phi: ['-2.0*z1']}}}}\n")
+    path.write_text(f'{section}: {{ros__parameters: {{{model}}}}}\n')
     estimator, tuning = read_parameters([path], ['noise_std:=0.1', 'gains:=self_tuning'])
     assert tuning['noise_std'] == 0.1
     values = VALUES.changed(tuning)

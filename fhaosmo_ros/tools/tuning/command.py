@@ -13,7 +13,7 @@ from fhaosmo_ros.core.model.triangular import TriangularModel
 from fhaosmo_ros.core.parameters.declaration import ParameterTable
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.files import dumps, load
-from fhaosmo_ros.core.parameters.per_channel import of_named_channel
+from fhaosmo_ros.core.parameters.per_channel import of_named_channel, split
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS, MODEL
 from fhaosmo_ros.core.simulation.metrics import rms
 from fhaosmo_ros.core.simulation.recordings import SENSOR
@@ -55,7 +55,7 @@ def main(argv: list[str] | None = None) -> int:
         '--bag', type=Path,
         help='find the gains that are likeliest for its y (of input_topic, input_field)',
     )  # fmt: skip
-    add('--channel', default='', metavar='NAME', help="whose y: of this one of a node's channels")
+    add('--channel', default='', metavar='NAME', help="for this one of a node's channels")
     add = parser.add_argument_group('from simulated recordings').add_argument
     add(
         '--trials', type=int, default=1000, metavar='N',
@@ -84,12 +84,14 @@ def _tune(arguments: argparse.Namespace, stop: Stop) -> None:
             'expected --trials >= 1, --jobs >= 1 and --seed >= 0, got '
             f'{arguments.trials}, {arguments.jobs} and {arguments.seed}'
         )
-    estimator, tuning = read_parameters(arguments.params_file, arguments.param)
+    estimator, tuning = read_parameters(
+        arguments.params_file, arguments.param, arguments.channel, arguments.bag is not None
+    )
     inputs = [arguments.bag] if arguments.bag else []
     with output_at(arguments.output, arguments.force, *inputs) as folder:
         if arguments.bag:
             with stop.raising():
-                parameters, text = _of_bag(arguments.bag, arguments.channel, estimator, tuning)
+                parameters, text = _of_bag(arguments.bag, estimator, tuning)
         else:
             parameters, text = _of_search(arguments, estimator, tuning, stop)
         folder.mkdir()
@@ -103,23 +105,33 @@ def _tune(arguments: argparse.Namespace, stop: Stop) -> None:
     print(f'use it: ros2 run fhaosmo_ros estimator --ros-args --params-file {gains}')
 
 
-def read_parameters(files: list[Path], rules: list[str]) -> tuple[dict[str, Any], dict[str, Any]]:
+def read_parameters(
+    files: list[Path], rules: list[str], channel: str = '', of_one: bool = False
+) -> tuple[dict[str, Any], dict[str, Any]]:
     """
     Return what files and rules set for the estimator, and for the tuning.
 
-    The gains are fixed ones, also where those files have a self-tuning estimator.
+    They are those of a `channel` if there is one to choose: `of_one` is meant, or some channel has
+    values of its own. The gains are fixed ones, also where the estimator tunes itself.
     """
-    estimator: dict[str, Any] = {}
-    tuning: dict[str, Any] = {}
-    for path in files:
-        found = load(path, 'estimator')
-        estimator |= found
-        # Where only the estimator has a model, the plant has the same one; and so the sensor.
-        tuning |= ParameterTable(MODEL, SENSOR).part_of(found)
-        tuning |= load(path, 'plant', TUNE_PARAMETERS) | load(path, 'tune', TUNE_PARAMETERS)
+    found = [load(path, 'estimator') for path in files]
     given = BOTH.coerce(values_of(rules))
-    estimator |= ESTIMATOR_PARAMETERS.part_of(given) | {'gains': 'fixed'}
-    return estimator, tuning | TUNE_PARAMETERS.part_of(given)
+    parts = [*found, ESTIMATOR_PARAMETERS.part_of(given)]
+    values = with_joints({name: value for part in parts for name, value in part.items()})
+    if channel or of_one or any(split(name)[0] for name in values):
+        channel, own = of_named_channel(values, channel, '--channel')
+        its_own = {name.removeprefix(f'{channel}.') for name in values}
+        values = {name: value for name, value in own.items() if name in its_own}
+        if channel:
+            values['channels'] = [channel]
+    tuning: dict[str, Any] = {}
+    prefix = f'{channel}.'
+    for path, of_file in zip(files, found, strict=True):
+        # Where only the estimator has a model, the plant has the same one; and so the sensor.
+        own = {k.removeprefix(prefix): v for k, v in of_file.items() if k.startswith(prefix)}
+        tuning |= ParameterTable(MODEL, SENSOR).part_of(of_file | own)
+        tuning |= load(path, 'plant', TUNE_PARAMETERS) | load(path, 'tune', TUNE_PARAMETERS)
+    return values | {'gains': 'fixed'}, tuning | TUNE_PARAMETERS.part_of(given)
 
 
 def _of_search(
@@ -153,15 +165,9 @@ def _of_search(
     return tuned, text
 
 
-def _of_bag(path: Path, channel: str, estimator: dict[str, Any], tuning: dict[str, Any]) -> Found:
+def _of_bag(path: Path, estimator: dict[str, Any], tuning: dict[str, Any]) -> Found:
     """Find the gains for what the y of a bag shows."""
-    values = with_joints(estimator)
-    channel, own = of_named_channel(values, channel, '--channel')
-    given = {name.removeprefix(f'{channel}.') for name in values}
-    estimator = {name: value for name, value in own.items() if name in given}
-    estimator['gains'] = 'fixed'  # also where the channel tunes itself
-    if channel:
-        estimator['channels'] = [channel]
+    (channel,) = estimator.get('channels', [''])
     if others := chosen_otherwise(estimator):
         raise ConfigurationError(
             f'--bag: expected gains of structure levant, got {", ".join(others)} set. Leave that '
