@@ -151,13 +151,13 @@ def test_command_says_what_a_bag_shows_or_that_it_can_give_no_gains(tmp_path, ca
     path = tmp_path / 'p.yaml'
     path.write_text(
         '/**: {ros__parameters: {channels: [hip, elbow], input_topic: /y, hip.gains: self_tuning, '
-        "hip.lambda: [1.0], elbow.phi: ['0', '0', '0']}}"
+        "hip.noise_size: 9.0, hip.lambda: [1.0], elbow.phi: ['0', '0', '0']}}"
     )
     command = [f'--bag={bag}', f'-o{out}', f'--params-file={path}', '--channel=hip']
     assert main([*command, '-p', 'noise_size:=1000.0']) == 2
     assert 'd = 0' in capsys.readouterr().err
     assert not out.exists()
-    assert main(command) == 0
+    assert main([*command, '-p', 'noise_size:=0.0']) == 0  # which wins
     values = load(out / 'gains.yaml', 'estimator')
     assert not OnlineEstimator(ESTIMATOR_PARAMETERS.complete(values)).observer.self_tuning
     assert values['noise_size'] == pytest.approx(1e-3, rel=0.1)

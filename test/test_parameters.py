@@ -156,13 +156,14 @@ def test_one_file_serves_channels_and_plant_and_a_replay_takes_one_channel(tmp_p
     words = ['--params-file', str(rig), '-p', 'knee.lambda:=3']
     default = CHANNEL_PARAMETERS.defaults()
     assert replayed(*words, '--channel', 'hip') == default | {'epsilon': 7.0}
+    assert replayed(*words, '--channel', 'hip', '-p', 'epsilon:=6')['epsilon'] == 6.0
     assert replayed(*words, '--channel', 'knee') == default | {'epsilon': 5.0, 'lambda': [3.0]}
-    with pytest.raises(ConfigurationError, match='--channel: expected hip or knee, got none'):
-        replayed(*words)
-    with pytest.raises(ConfigurationError, match='--channel: expected the name of a joint'):
-        replayed('-p', 'channels:=from_joint_names')
-    with pytest.raises(ConfigurationError, match=r'--channel: expected none, .* got hip'):
-        replayed('--channel', 'hip')
+    for wrong, said in (
+        (words, 'hip or knee, got none'), (['--channel', 'hip'], 'none, .* got hip'),
+        (['-p', 'channels:=from_joint_names'], 'the name of a joint'),
+    ):  # fmt: skip
+        with pytest.raises(ConfigurationError, match=f'--channel: expected {said}'):
+            replayed(*wrong)
 
 
 def setting(values: str, section: str = '/**') -> str:

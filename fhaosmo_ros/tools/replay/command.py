@@ -108,16 +108,19 @@ def make_estimator(
     given += [(path, read(path, arguments.node, strict=True)) for path in arguments.params_file]
     values: dict[str, Any] = {}
     origins: dict[str, Any] = {}
-    for origin, found in [*given, (None, values_of(arguments.param))]:
+    rules = values_of(arguments.param)
+    for origin, found in [*given, (None, rules)]:
         values |= found
         origins |= dict.fromkeys(found, origin)
     try:
         values = select(values, ESTIMATOR_PARAMETERS)
     except ConfigurationError as error:
         raise with_origin(error, origins) from None
-    named = of_named_channel(with_joints(values), arguments.channel, '--channel')
-    arguments.channel, own = named
-    parameters = CHANNEL_PARAMETERS.complete(own)
+    channel, own = of_named_channel(with_joints(values), arguments.channel, '--channel')
+    arguments.channel = channel
+    # A rule wins over the channel's own value in a file, too.
+    won = {n: v for n, v in values.items() if n in rules and f'{channel}.{n}' not in rules}
+    parameters = CHANNEL_PARAMETERS.complete(own).changed(CHANNEL_PARAMETERS.part_of(won))
     if arguments.bag.suffix == '.csv':  # it says where y and u are, not the topics of a node
         parameters = parameters.changed(ParameterTable(INPUT).defaults())
     if arguments.smooth:
@@ -125,7 +128,7 @@ def make_estimator(
     try:
         estimator = OnlineEstimator(parameters)
     except ConfigurationError as error:
-        raise with_origin(error, origins, arguments.channel) from None
+        raise with_origin(error, origins, channel) from None
     if arguments.smooth:
         estimator.smooth()
     return parameters, estimator

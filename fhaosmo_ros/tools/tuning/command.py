@@ -121,7 +121,7 @@ def read_parameters(
     if channel or of_one or any(split(name)[0] for name in values):
         channel, own = of_named_channel(values, channel, '--channel')
         its_own = {name.removeprefix(f'{channel}.') for name in values}
-        values = {name: value for name, value in own.items() if name in its_own}
+        values = {name: value for name, value in own.items() if name in its_own} | parts[-1]
         if channel:
             values['channels'] = [channel]
     tuning: dict[str, Any] = {}
