@@ -132,8 +132,7 @@ def test_estimator_loads_the_output_and_the_next_tuning_begins_there(arguments, 
     # What the report says of the gains is what these very gains do.
     judged = Objective(Family(SHORT).recordings(2, 1), VALUES)(values)[0]
     assert f'{judged:.4f}' == row(report, 'error, relative')[4].strip()
-    given = str(first / 'gains.yaml')
-    more = ['--trials=3', '--params-file', given, '-o', str(out), '-pnoise_std:=0']
+    more = ['--trials=3', f'--params-file={first}/gains.yaml', f'-o{out}', '-pnoise_std:=0']
     assert main([*arguments, *more]) == 0
     assert 'gains are for a y without noise' not in report
     report = (out / 'report.md').read_text()
