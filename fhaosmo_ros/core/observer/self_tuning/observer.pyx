@@ -342,9 +342,7 @@ cdef class SelfTuning(Structure):
             off = fmin(off, fabs(change))
         return off > fmax(0.5 * usual, HUBER * sqrt(2.0 * shared.jitter))
 
-    cdef bint is_likely_when_even(
-        self, double h, const double* u, double gate
-    ) noexcept nogil:
+    cdef bint is_likely_when_even(self, double h, const double* u, double gate) noexcept nogil:
         """
         Take an evenly spaced sample at the likeliest of its times; return True if it is likely.
 
