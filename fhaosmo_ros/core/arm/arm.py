@@ -82,6 +82,8 @@ class Arm:
     model : ArmModel
     calibration : Calibration
         What is known of this arm.
+    torque_constants : (n,) array
+        Joint torque for one unit of effort: those of the parameters, else of the calibration.
     counters : Counter
         Samples by what became of them.
     problem : str
@@ -121,7 +123,7 @@ class Arm:
         self._with_gravity = p['effort'] != 'gravity_compensated'
         self._delay = p['torque_delay']
         given = self._values('torque_constants')
-        constants = np.where(given == 1.0, known.torque_constants, given)
+        constants = self.torque_constants = np.where(given == 1.0, known.torque_constants, given)
         scale = model.torque_of_weight()
         scale = self._weight = np.maximum(scale, LEAST * np.max(scale))
         usual = [TORQUE_NOISE * scale, self._values('position_noise'), MODEL_ERROR * scale]

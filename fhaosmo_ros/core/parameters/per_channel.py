@@ -6,7 +6,7 @@ The parameters of a node, checked as a whole, and those of an estimator with man
 else the common value.
 """
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import replace
 import re
 from typing import Any
@@ -132,11 +132,14 @@ def of_channel(values: Mapping[str, Any], name: str) -> Parameters:
     return Parameters(ESTIMATOR_PARAMETERS, common | own)
 
 
-def of_named_channel(values: Mapping[str, Any], name: str, what: str) -> tuple[str, Parameters]:
+def of_named_channel(
+    values: Mapping[str, Any], name: str, what: str, rules: Collection[str] = ()
+) -> tuple[str, Parameters]:
     """
     Return name and parameters of a channel that a user named; a single one need not be named.
 
-    Raises ConfigurationError of `what` if there is none.
+    Values that a command line has set, by the names in `rules`, win over the channel's own. Raises
+    ConfigurationError of `what` if there is none.
     """
     names = channel_names(values)
     if not name and len(names) == 1 and names != FROM_JOINTS:
@@ -145,7 +148,8 @@ def of_named_channel(values: Mapping[str, Any], name: str, what: str) -> tuple[s
         words = {'': 'none, as the node has no channels', FROM_JOINTS[0]: 'the name of a joint'}
         allowed = ' or '.join(words.get(known, known) for known in names)
         raise ConfigurationError(f'{what}: expected {allowed}, got {name or "none"}')
-    return name, of_channel(values, name)
+    beaten = {f'{name}.{rule}' for rule in rules} - set(rules)
+    return name, of_channel({k: v for k, v in values.items() if k not in beaten}, name)
 
 
 def differing(values: Parameters) -> dict[str, Any]:

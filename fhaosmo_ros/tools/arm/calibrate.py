@@ -55,17 +55,16 @@ def _calibrate(arguments: argparse.Namespace, stop: Stop) -> None:
         good = np.isfinite(samples).all(axis=(1, 2)) & (when > newest)
         t = (when[good] - when[good][:1]) * 1e-9
         q, effort, *velocity = samples[good].swapaxes(0, 1)
-        known, later = arm.calibration, t + arm.parameters['torque_delay']
+        later, constants = t + arm.parameters['torque_delay'], arm.torque_constants
         torque = np.column_stack([np.interp(later, t, column) for column in effort.T])
-        given, usual = np.array(arm.parameters['torque_constants']), known.torque_constants
         if arm.parameters['effort'] == 'current' and not arguments.payload:
-            usual = 0.0 * usual  # to be found
-        constants = np.where(given == 1.0, usual, given)
+            given = np.array(arm.parameters['torque_constants'])
+            constants = np.where(given == 1.0, 0.0, constants)  # those that are to be found
         if arm.parameters['effort'] == 'gravity_compensated':
             gravity = np.array([arm.model.terms(row, 0.0 * row).gravity for row in q])
             torque += gravity / constants
         if arguments.payload:
-            known = replace(known, torque_constants=constants)
+            known = replace(arm.calibration, torque_constants=constants)
             payload, *left = identification.payload_of_motion(arm.model, t, q, torque, known)
             print(_table(arm.joints, 'without', 'with payload', *left))
             numbers = ', '.join(f'{x:.4g}' for x in payload)

@@ -116,11 +116,9 @@ def make_estimator(
         values = select(values, ESTIMATOR_PARAMETERS)
     except ConfigurationError as error:
         raise with_origin(error, origins) from None
-    channel, own = of_named_channel(with_joints(values), arguments.channel, '--channel')
-    arguments.channel = channel
-    # A rule wins over the channel's own value in a file, too.
-    won = {n: v for n, v in values.items() if n in rules and f'{channel}.{n}' not in rules}
-    parameters = CHANNEL_PARAMETERS.complete(own).changed(CHANNEL_PARAMETERS.part_of(won))
+    values = with_joints(values)
+    channel, own = of_named_channel(values, arguments.channel, '--channel', rules)
+    arguments.channel, parameters = channel, CHANNEL_PARAMETERS.complete(own)
     if arguments.bag.suffix == '.csv':  # it says where y and u are, not the topics of a node
         parameters = parameters.changed(ParameterTable(INPUT).defaults())
     if arguments.smooth:

@@ -63,12 +63,9 @@ def main(argv: list[str] | None = None) -> int:
     )  # fmt: skip
     cores = os.cpu_count() or 1
     add(
-        '--jobs',
-        type=int,
-        default=cores,
-        metavar='N',
-        help='trials at a time (default: %(default)s)',
-    )
+        '--jobs', type=int, default=cores, metavar='N',
+        help='trials at a time (default: one a core, %(default)s)',
+    )  # fmt: skip
     add('--seed', type=int, default=1, help='of recordings and search (default: %(default)s)')
     add(
         '--storage', metavar='URL',
@@ -119,9 +116,9 @@ def read_parameters(
     parts = [*found, ESTIMATOR_PARAMETERS.part_of(given)]
     values = with_joints({name: value for part in parts for name, value in part.items()})
     if channel or of_one or any(split(name)[0] for name in values):
-        channel, own = of_named_channel(values, channel, '--channel')
+        channel, own = of_named_channel(values, channel, '--channel', given)
         its_own = {name.removeprefix(f'{channel}.') for name in values}
-        values = {name: value for name, value in own.items() if name in its_own} | parts[-1]
+        values = {name: value for name, value in own.items() if name in its_own}
         if channel:
             values['channels'] = [channel]
     tuning: dict[str, Any] = {}
