@@ -5,6 +5,7 @@ from libc.math cimport INFINITY, NAN, exp, fabs, fmax, fmin, log, pow, sqrt
 from libc.stdlib cimport calloc, free
 from libc.string cimport memcpy, memset
 
+from fhaosmo_ros.core.model.phi cimport evaluate
 from fhaosmo_ros.core.model.prediction cimport MOST_LEVELS
 from fhaosmo_ros.core.observer.self_tuning.intervals cimport choose_members, take_interval
 from fhaosmo_ros.core.observer.self_tuning.jumps cimport (
@@ -140,6 +141,8 @@ cdef class SelfTuning(Structure):
                 self.level[i].z_hat, self.trial_variances[i] = 0.0, INFINITY
             self.level[0].z_hat = y
             gather(self.members)
+            if self.has_begun():
+                self.begin_at_rest(u)
         for i in range(n):  # the internal states stand for the estimates
             self.level[i].z_tilde = self.level[i + 1].z_hat if i + 1 < n else 0.0
 
@@ -210,6 +213,33 @@ cdef class SelfTuning(Structure):
         else:
             for i in range(3 + ORDERS):
                 tuning[i] = NAN
+
+    cdef void begin_at_rest(self, const double* u) noexcept nogil:
+        """
+        Let the members begin as if z stood still (D 28).
+
+        Then z_{i+1} is -Phi_i; it is off that by z_i', whose size differences of y have told, and
+        by what Phi_i changes with the states before it, which are off as well.
+        """
+        cdef Members* m = self.members
+        cdef double along[MOST_LEVELS]
+        cdef double* z = self.prediction.z
+        cdef double slope
+        cdef int n = self.order, i, j, g
+        memset(along, 0, sizeof(along))
+        z[0] = self.level[0].z_hat
+        for i in range(1, n):
+            z[i] = -evaluate(self.prediction.phi, i - 1, z, along, u).value
+            for j in range(1, i):
+                along[j] = sqrt(m.sizes[j])
+                slope = evaluate(self.prediction.phi, i - 1, z, along, u).slope
+                m.sizes[i] += slope * slope
+                along[j] = 0.0
+            if not (fabs(z[i]) <= LARGEST and m.sizes[i] <= LARGEST):
+                z[i] = m.sizes[i] = 0.0
+            self.level[i].z_hat = z[i]
+            for g in range(COUNT):
+                m.x.z[i][g], entry(&m.p, n, i, i)[g] = z[i], m.sizes[i]
 
     # A step of all members
 
@@ -377,7 +407,7 @@ cdef class SelfTuning(Structure):
         cdef Shared* shared = &m.shared
         cdef double of_colours[COLOURS]
         cdef double mean = self.memory.period if self.memory.period > 0.0 else h, ratio, limit
-        cdef double noisiest = shared.first_noise, slowed
+        cdef double noisiest = shared.first_noise, slowed, unsettled
         cdef int g, c, moving = 0
         cdef bint changed
         if not same:
@@ -398,13 +428,13 @@ cdef class SelfTuning(Structure):
             m.used_noise = m.work.now
         if changed or not self.is_linear:
             shared.unsettled, shared.steady_period = 0.0, mean
-        shared.unsettled += h
+        unsettled = shared.unsettled + h
         for c in range(COLOURS):
             noisiest = fmax(noisiest, m.used_noise[c])
         slowed = pow(shared.first_noise / noisiest, 0.5 / (self.order + 1))
         for c in range(BANDS):
             g = HALF + c * IN_BAND
-            if m.kappa[g] / DECAY * slowed * shared.unsettled < FADED:
+            if m.kappa[g] / DECAY * slowed * unsettled < FADED:
                 moving += IN_BAND
         return min((moving + EVEN - 1) // EVEN * EVEN, HALF)
 
@@ -445,6 +475,7 @@ cdef class SelfTuning(Structure):
         cdef Members* m = self.members
         cdef Sample* sample = &m.work.sample
         cdef bint quantised = sample.quanta > 0.0
+        m.shared.unsettled += sample.h
         follow_noise(m)
         follow_innovations(m)
         if quantised:
