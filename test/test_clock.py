@@ -107,3 +107,32 @@ def test_samples_of_a_clock_that_jumps_back_restart_within_one_tick(together):
     counters = estimator.counters
     assert counters.restarts_backward == counters.restarts == 1
     assert 0 < estimator.stamp < 100 * MS
+
+
+def read_in_bursts(period: float):
+    """Return stamps of TRUE's samples by a driver that reads a buffer each so many ms, late."""
+    late = np.abs(np.random.default_rng(3).normal(0.0, 5e4, 10_000)).astype(np.int64)
+    reads = TRUE[0] + (period * MS * np.arange(10_000)).astype(np.int64) + late
+    burst = np.searchsorted(reads, TRUE)
+    return reads[burst] + 5000 * (np.arange(10_000) - np.searchsorted(burst, burst))
+
+
+@pytest.mark.parametrize('period', [2, 7.3, 16])
+def test_samples_that_a_driver_reads_in_bursts_lie_on_a_line(period):
+    estimator, times = OnlineEstimator(), []
+    for k, stamp in enumerate(read_in_bursts(period).tolist()):
+        estimator.update(stamp, sample(k))
+        times.append(estimator.stamp)
+    assert np.diff(times)[3000:] == pytest.approx(MS, rel=0.002)
+    assert times[3000:] == pytest.approx(TRUE[3000:], abs=MS)
+    assert estimator.counters.spread_stamps > 0.9 * (1.0 - 1.0 / period) * len(TRUE)
+
+
+@pytest.mark.parametrize('noise', [0.0, 1e-4])
+def test_samples_that_are_taken_in_bursts_keep_their_stamps(noise):
+    k = np.arange(5000)
+    stamps = START + MS * (k // 10 * 10) + 5000 * (k % 10)
+    estimator = OnlineEstimator()
+    y = 0.2 + 0.1 * np.sin(1e-8 * (stamps - START))
+    estimator.run(stamps, y + noise * np.random.default_rng(0).standard_normal(5000))
+    assert estimator.counters.spread_stamps == 0

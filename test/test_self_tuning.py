@@ -162,7 +162,7 @@ def swept(period=PERIOD, shape=np.sin):
 def test_little_noise_or_none(noise, period):
     """A smooth d moves y by up to 1e5 times the noise in a sample; d is found, with its jumps."""
     for shape, limit in ((np.sin, 0.03), (lambda phase: np.sign(np.sin(phase)), 0.6)):
-        t, y, d = swept(period, shape)
+        t, y, d = (values[: -round(0.5 / period)] for values in swept(period, shape))  # to no jump
         y = y + noise * np.random.default_rng(7).standard_normal(len(t))
         observer = Observer(MOTOR)
         run = observer.run(t, y)
@@ -233,6 +233,33 @@ def test_samples_that_wait_for_a_host_that_hangs_are_evenly_spaced(seed, period,
     found = estimated(model | SELF_TUNING, stamps, truth.y)
     error = (found.unknown_input - truth.unknown_input)[1000:]
     assert rms(error) < most * rms(truth.unknown_input)
+
+
+@pytest.mark.parametrize('changes', [{}, SELF_TUNING])
+def test_a_driver_that_empties_a_buffer_does_no_harm(case, changes):
+    t, z, d, noise = case
+    burst = np.floor(t / (16.3 * PERIOD))
+    read = 16.3 * PERIOD * (burst + 1) + 5e-6 * (np.arange(len(t)) - np.searchsorted(burst, burst))
+    exact, found = (
+        rms((estimated(changes, times, z[:, 0] + 1e-6 * noise).unknown_input - d)[10_000:])
+        for times in (t, read)
+    )
+    assert found < 1.1 * exact
+
+
+@pytest.mark.parametrize('first', [0.0, 1.0, -100.0])
+def test_it_begins_wherever_the_plant_is(first):
+    """Where Phi_1 is not 0, z_2 of a plant that stands still is far off what y's speed tells."""
+    model = np.array([[-20.0, 1.0], [0.0, -1.0]])
+    d = 20.0 * first + matern(8000, 2.0, 2, np.random.default_rng(6))
+    y = states_of(model, d, [first, 20.0 * first])[:, 0]
+    y += 1e-5 * np.random.default_rng(7).standard_normal(len(y))
+    values = SELF_TUNING | {'order': 2, 'phi': ['-20*z1', '-z2']}
+    estimator = OnlineEstimator(values)
+    error = estimator.run(stamps_of(np.arange(len(y)) * PERIOD), y).unknown_input - d
+    assert estimator.counters.rejected < 20
+    assert rms(error[2000:]) < 0.2 + 0.02 * abs(first)
+    assert np.abs(error).max() < 2.0 * np.abs(d).max()
 
 
 @pytest.mark.parametrize('noise', [0.0, 1e-5])

@@ -20,11 +20,13 @@ FINITE, NOT_NEGATIVE, AT_LEAST_1 = (-LARGEST, LARGEST), (0.0, LARGEST), (1.0, LA
 RANGES: dict[str, tuple[float, float]] = {
     **dict.fromkeys(('pending', 'period', 'interval', 'since'), NOT_NEGATIVE),
     **dict.fromkeys(('watched', 'saturated', 'spacing'), NOT_NEGATIVE),
-    'beyond': (0.0, math.inf),
+    **dict.fromkeys(('moved', 'time_of_bursts', 'samples_of_bursts'), NOT_NEGATIVE),
+    **dict.fromkeys(('within_bursts', 'between_bursts'), NOT_NEGATIVE),
+    'beyond': (0.0, math.inf), 'share_of_bursts': (0.0, 1.0),
     **dict.fromkeys(('spread', 'scale'), AT_LEAST_1),
     **dict.fromkeys(('spikes', 'tick_count', 'repeats'), COUNTS),
     **dict.fromkeys(('mean_interval', 'longest_mean'), COUNTS),
-    'intervals': (0, 32), 'ticks': (0, 256), 'repeated': (0.0, 1.0),
+    'intervals': (0, 32), 'ticks': (0, 1024), 'repeated': (0.0, 1.0),
     'event': (0, 5), 'event_deviation': (0.0, math.inf), 'past_place': (0, 511),
     'past_count': (0, 512),
 }  # fmt: skip

@@ -15,7 +15,23 @@ cdef struct Clock:
     double spacing  # of samples, by the line (ns)
 
 
+cdef struct Bursts:
+    # What samples are like that come in bursts.
+    bint in_bursts  # most do, and are placed on the line
+    long long last_stamp
+    double last_y
+    long long before  # the stamp before the burst
+    double moved  # steps of y within the burst so far
+    # Decaying sums: stamps from one burst to the next (ns), samples, and steps of y.
+    double time_of_bursts, samples_of_bursts, within_bursts, between_bursts
+    double share_of_bursts  # of late, of all that came; others are single samples, or off the line
+
+
 cdef long long difference(long long a, long long b) noexcept nogil
+cdef long long before_burst(
+    Bursts* bursts, const Clock* clock, long long stamp, double y, long long max_gap
+) noexcept nogil
+cdef bint comes_in_bursts(const Bursts* bursts) noexcept nogil
 cdef long long clock_time(
-    Clock* clock, long long stamp, long long max_gap, long long* spread
+    Clock* clock, long long stamp, long long latest, long long max_gap, long long* spread
 ) noexcept nogil

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The time of a sample by a clock that stands still between its ticks, in nanoseconds."""
 
-from libc.math cimport fabs
+from libc.math cimport fabs, isfinite
 
 # Stands for every difference (ns) that an integer may not hold.
 cdef long long FAR = 4_000_000_000_000_000_000
@@ -9,9 +9,16 @@ cdef long long FAR = 4_000_000_000_000_000_000
 # halves what it remembers: when the node has not run for a moment, ticks and samples come at once,
 # in any order.
 cdef double NEAR = 4.0
-# Ticks that the line remembers at most, and samples in which times follow it.
-cdef long long MOST_TICKS = 256
-cdef double SMOOTH = 50.0
+# Ticks that the line remembers at most; samples in which times follow it, and at least for each
+# tick that it remembers: a kink of the times is one of the states.
+cdef long long MOST_TICKS = 1024
+cdef double SMOOTH = 50.0, EASY = 4.0
+# Stamps closer than this part of the mean interval are those of a burst.
+cdef double TOGETHER = 0.25
+# Bursts that are remembered. Samples come in them if most of these are such, and a line goes
+# through them, until few are; and if y moves from one to the next less than so many times as far
+# as within them.
+cdef double REMEMBERED = 5.0, MOST = 0.75, FEW = 0.25, FARTHER = 2.0
 
 
 cdef long long difference(long long a, long long b) noexcept nogil:
@@ -22,11 +29,52 @@ cdef long long difference(long long a, long long b) noexcept nogil:
     return -FAR if rough < -FAR else a - b
 
 
-cdef long long clock_time(
-    Clock* clock, long long stamp, long long max_gap, long long* spread
+cdef long long before_burst(
+    Bursts* bursts, const Clock* clock, long long stamp, double y, long long max_gap
 ) noexcept nogil:
     """
-    Return the time of a sample that came when the clock read `stamp`.
+    Return the stamp before the burst that a sample comes in, and follow what bursts are like.
+
+    A driver that empties a buffer stamps samples as it reads them, when the last one has been
+    taken: the first one was taken after the last one of the burst before.
+    """
+    cdef double kept = 1.0 - 1.0 / REMEMBERED
+    cdef double step = fabs(y - bursts.last_y)
+    cdef long long length = difference(stamp, bursts.last_stamp), count = clock.tick_count
+    if not isfinite(step):
+        step, y = 0.0, bursts.last_y
+    if count == 0 or not 0 <= length <= max_gap:
+        bursts.before, bursts.moved = stamp - 1, 0.0
+    elif length * bursts.samples_of_bursts < TOGETHER * bursts.time_of_bursts:
+        bursts.moved += step
+    else:
+        bursts.time_of_bursts *= kept
+        bursts.time_of_bursts += difference(bursts.last_stamp, bursts.before)
+        bursts.samples_of_bursts = kept * bursts.samples_of_bursts + count
+        bursts.share_of_bursts *= kept
+        bursts.share_of_bursts += (1.0 - kept) * (count > 1 and clock.ticks > 2)
+        if count > 1:
+            bursts.within_bursts = kept * bursts.within_bursts + bursts.moved / (count - 1)
+            bursts.between_bursts = kept * bursts.between_bursts + step
+        bursts.before, bursts.moved = bursts.last_stamp, 0.0
+    bursts.last_stamp, bursts.last_y = stamp, y
+    return bursts.before
+
+
+cdef bint comes_in_bursts(const Bursts* bursts) noexcept nogil:
+    """Return True if samples come in bursts, and y moves as if it were sampled evenly."""
+    if bursts.in_bursts:
+        return bursts.share_of_bursts > FEW
+    return bursts.share_of_bursts > MOST and (
+        bursts.between_bursts < FARTHER * bursts.within_bursts
+    )
+
+
+cdef long long clock_time(
+    Clock* clock, long long stamp, long long latest, long long max_gap, long long* spread
+) noexcept nogil:
+    """
+    Return the time of a sample, `latest` at most, that came when the clock read `stamp`.
 
     A straight line is fitted to the ticks by least squares with a growing memory (an alpha-beta
     filter), and times follow it smoothly: a tick, or a sample, that comes late moves them by
@@ -46,12 +94,14 @@ cdef long long clock_time(
         if not take_tick(clock, count):
             return clock.placed
     ahead = difference(clock.placed, stamp)
-    step = clock.spacing + (clock.on_line - ahead - clock.spacing) / SMOOTH
-    # A line goes on for as many samples as it remembers ticks, if the next tick does not come.
-    most = 0.5 * (clock.tick_length + max(clock.ticks - 1, 0) * clock.spacing - ahead)
-    if step > most:
-        step, clock.on_line = most, ahead + most
-    step = max(step, 0.5 * min(clock.spacing, most))
+    step = (clock.on_line - ahead - clock.spacing) / max(SMOOTH, EASY * clock.ticks)
+    step += clock.spacing
+    most = difference(latest, clock.placed)
+    if latest == FAR:  # it goes on for as many samples as it remembers ticks without the next one
+        most = 0.5 * (clock.tick_length + max(clock.ticks - 1, 0) * clock.spacing - ahead)
+        if step > most:
+            clock.on_line = ahead + most
+    step = max(min(step, most), 0.5 * min(clock.spacing, most))
     if step >= 1.0:
         clock.placed += <long long>step
         spread[0] += length == 0

@@ -17,7 +17,9 @@ from fhaosmo_ros.core.observer.status cimport (
     REJECTED_SPIKE, REJECTED_STEP, REJECTED_STUCK, REPEATED, RESTARTED, UNUSED
 )
 from fhaosmo_ros.core.observer.structure cimport Estimate, Memory, MOST_INPUTS, Record, Structure
-from fhaosmo_ros.core.online.clock cimport FAR, Clock, clock_time, difference
+from fhaosmo_ros.core.online.clock cimport (
+    FAR, Bursts, Clock, before_burst, clock_time, comes_in_bursts, difference
+)
 
 from collections import namedtuple
 
@@ -78,7 +80,7 @@ cdef struct Counts:
     long long rejected_inputs  # u was NaN or infinite; the one before is held
     long long gaps  # intervals of more than twice the mean that were bridged in sub-steps
     long long sub_steps  # that these took
-    long long spread_stamps  # at the clock time of the one before: spread
+    long long spread_stamps  # at the clock time of the one before, or in its burst: spread
     long long bursts  # samples within a tenth of the mean interval after the one before
     long long spikes_believed  # five samples in a row were beyond the gate: a real step of y
     long long stuck  # times that y began to be stuck
@@ -157,6 +159,7 @@ cdef class Policy:
     cdef public Counts counters
     cdef readonly Course course
     cdef Clock clock
+    cdef Bursts bursts
     cdef Sensor sensor
     # The known inputs of late: for the next sample; at the latest one that was used; a ring of
     # pieces of time with the same inputs, each its duration (ns) and these.
@@ -214,8 +217,8 @@ cdef class Policy:
         if self.settings.nominal:
             course.now += self.settings.nominal_period
             now = course.now
-        elif self.settings.by_clock and stamp != 0:  # 0 is no tick: the clock is not known yet
-            now = clock_time(&self.clock, stamp, self.max_gap(), &self.counters.spread_stamps)
+        elif stamp != 0:  # else there is no time yet
+            now = self.place(stamp, y)
         word = self.judge(stamp, now, y)
         if not word and not isnan(memory.y):
             elapsed = self.since_latest(now, y, &word)
@@ -320,6 +323,32 @@ cdef class Policy:
         return self.course.spikes > 0
 
     # Time
+
+    cdef long long place(self, long long stamp, double y) noexcept nogil:
+        """
+        Return the time of a sample: its stamp, or its place on a line through ticks (clock.pyx).
+
+        Ticks are those of the node's clock, or the bursts in which samples come.
+        """
+        cdef Clock* clock = &self.clock
+        cdef Bursts* bursts = &self.bursts
+        cdef long long longest = self.max_gap(), spread = 0, reading, latest, placed
+        cdef bint before = bursts.in_bursts
+        if self.settings.by_clock:
+            return clock_time(clock, stamp, FAR, longest, &self.counters.spread_stamps)
+        reading = before_burst(bursts, clock, stamp, y, longest)
+        latest = stamp + <long long>fmin(clock.spacing, FAR)
+        placed = clock_time(clock, reading, latest, longest, &spread)
+        bursts.in_bursts = comes_in_bursts(bursts)
+        if bursts.in_bursts != before:
+            self.course.timed = False
+            placed = clock.placed = clock.tick + <long long>clock.on_line
+            if not before:
+                self.structure.begin_afresh()  # with the true intervals
+        if not bursts.in_bursts:
+            return stamp
+        self.counters.spread_stamps += spread
+        return placed
 
     cdef long long since_latest(self, long long now, double y, int* word) noexcept nogil:
         """Return the time (ns) to step over to a sample, 0 to a first one; add flags to `word`."""
@@ -630,15 +659,17 @@ cdef class Policy:
 
     @property
     def memory(self):
-        """What it remembers by name: members of `Course`, `Clock` and `Sensor`, and arrays."""
-        cdef dict course = self.course, clock = self.clock, sensor = self.sensor
-        return course | clock | sensor | {name: a.copy() for name, a in self.arrays.items()}
+        """What it remembers by name: members of `Course`, `Clock`, `Bursts`, `Sensor`; arrays."""
+        cdef dict course = self.course, clock = self.clock, bursts = self.bursts
+        cdef dict sensor = self.sensor
+        arrays = {name: array.copy() for name, array in self.arrays.items()}
+        return course | clock | bursts | sensor | arrays
 
     def change(self, **values):
         """Remember other values: those of `memory` by name."""
         cdef dict memory = self.memory | values
         self.enter()
-        self.course, self.clock, self.sensor = memory, memory, memory
+        self.course, self.clock, self.bursts, self.sensor = memory, memory, memory, memory
         for name, array in self.arrays.items():
             array[:] = memory[name]
 

@@ -18,7 +18,7 @@ from fhaosmo_ros.core.parameters.errors import ConfigurationError
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-VERSION = 11
+VERSION = 12
 """Of the names."""
 HALF = 2**32
 INTEGER = 'integer'

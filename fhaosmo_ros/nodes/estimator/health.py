@@ -136,8 +136,12 @@ class Health:
         restarts += 'always comes so slowly, set max_gap to several of its periods'
         report.find(WARN, restarts, news['restarts'])
         spread = news['spread stamps']
-        ticks = f'/clock ticks once for {used / max(1, used - spread):.0f} samples'
-        report.find(WARN, ticks, used < 2 * spread)
+        many = f'{used / max(1, used - spread):.2g}'
+        by_clock, shared = limits['sampling'] == 'clock', 3 * spread > used
+        report.find(WARN, f'/clock ticks once for {many} samples', by_clock and shared)
+        bursts = f'samples come {many} at a time and are taken to be evenly spaced: if they are, '
+        bursts += f'set sampling to nominal and nominal_period to {period:.4g}'
+        report.find(WARN, bursts, shared and not by_clock)
         uneven = f'intervals between samples differ by {jitter:.3g} of their mean: if the sensor '
         uneven += f'samples evenly, set sampling to nominal and nominal_period to {period:.4g}'
         report.find(WARN, uneven, jitter > JITTER and limits['sampling'] != 'nominal')
