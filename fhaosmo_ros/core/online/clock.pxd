@@ -10,6 +10,7 @@ cdef struct Clock:
     long long tick_length  # time from the reading before it
     long long tick_count  # samples at it
     long long ticks  # that the line remembers; 0: no line
+    long long off_line  # latest ones in a row that were off it
     long long placed  # where the latest sample was put
     double on_line  # where the line has it (ns after `tick`)
     double spacing  # of samples, by the line (ns)

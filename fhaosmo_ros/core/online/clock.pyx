@@ -13,12 +13,15 @@ cdef double NEAR = 4.0
 # tick that it remembers: a kink of the times is one of the states.
 cdef long long MOST_TICKS = 1024
 cdef double SMOOTH = 50.0, EASY = 4.0
+# Bursts in a row that may be off the line: a driver that was preempted has not emptied its buffer.
+cdef long long PATIENCE = 5
 # Stamps closer than this part of the mean interval are those of a burst.
 cdef double TOGETHER = 0.25
 # Bursts that are remembered. Samples come in them if most of these are such, and a line goes
 # through them, until few are; and if y moves from one to the next less than so many times as far
 # as within them.
-cdef double REMEMBERED = 5.0, MOST = 0.75, FEW = 0.25, FARTHER = 2.0
+cdef long long MOST_VOTES = 4  # of the samples of a burst, in the share of bursts
+cdef double REMEMBERED = 10.0, MOST = 0.75, FEW = 0.25, FARTHER = 2.0
 
 
 cdef long long difference(long long a, long long b) noexcept nogil:
@@ -51,8 +54,9 @@ cdef long long before_burst(
         bursts.time_of_bursts *= kept
         bursts.time_of_bursts += difference(bursts.last_stamp, bursts.before)
         bursts.samples_of_bursts = kept * bursts.samples_of_bursts + count
-        bursts.share_of_bursts *= kept
-        bursts.share_of_bursts += (1.0 - kept) * (count > 1 and clock.ticks > 2)
+        for _ in range(min(count, MOST_VOTES)):
+            bursts.share_of_bursts *= kept
+            bursts.share_of_bursts += (1.0 - kept) * (count > 1 and clock.ticks > 2)
         if count > 1:
             bursts.within_bursts = kept * bursts.within_bursts + bursts.moved / (count - 1)
             bursts.between_bursts = kept * bursts.between_bursts + step
@@ -91,7 +95,7 @@ cdef long long clock_time(
     if length > 0:
         clock.tick, clock.tick_length, clock.tick_count = stamp, length, 1
         clock.on_line -= length
-        if not take_tick(clock, count):
+        if not take_tick(clock, count, 0 if latest == FAR else PATIENCE):
             return clock.placed
     ahead = difference(clock.placed, stamp)
     step = (clock.on_line - ahead - clock.spacing) / max(SMOOTH, EASY * clock.ticks)
@@ -108,18 +112,22 @@ cdef long long clock_time(
     return clock.placed
 
 
-cdef bint take_tick(Clock* clock, long long count) noexcept nogil:
+cdef bint take_tick(Clock* clock, long long count, long long patience) noexcept nogil:
     """
     Correct the line by a tick that came after `count` samples at the one before.
 
-    Return False if time does not follow the line: it begins anew, and has its first sample.
+    As many as `patience` in a row that are off the line do nothing. Return False if time does not
+    follow the line: it begins anew, and has its first sample.
     """
     cdef double error = -clock.on_line, n = clock.ticks + 1
     cdef bint lost = not fabs(error) < clock.ticks * clock.spacing
     if not lost and fabs(error) <= NEAR * clock.spacing:
-        clock.ticks = min(clock.ticks + 1, MOST_TICKS)
+        clock.ticks, clock.off_line = min(clock.ticks + 1, MOST_TICKS), 0
         clock.on_line += (4.0 * n - 2.0) / (n * (n + 1.0)) * error
         clock.spacing += 6.0 / (n * (n + 1.0)) * error / count
+        return True
+    clock.off_line += 1
+    if clock.ticks > 2 and clock.off_line <= patience:
         return True
     clock.ticks //= 2
     if clock.ticks > 1 and not lost:

@@ -136,15 +136,16 @@ class Health:
         restarts += 'always comes so slowly, set max_gap to several of its periods'
         report.find(WARN, restarts, news['restarts'])
         spread = news['spread stamps']
-        many = f'{used / max(1, used - spread):.2g}'
-        by_clock, shared = limits['sampling'] == 'clock', 3 * spread > used
+        many = f'{used / max(1, used - spread):.0f}'
+        by_clock, shared = limits['sampling'] == 'clock', used < 2 * spread
         report.find(WARN, f'/clock ticks once for {many} samples', by_clock and shared)
-        bursts = f'samples come {many} at a time and are taken to be evenly spaced: if they are, '
-        bursts += f'set sampling to nominal and nominal_period to {period:.4g}'
-        report.find(WARN, bursts, shared and not by_clock)
+        bursts = 'samples come in bursts and are taken to be evenly spaced: if they are, set '
+        bursts += f'sampling to nominal and nominal_period to {period:.4g}'
+        report.find(WARN, bursts, spread > 0 and not by_clock)
         uneven = f'intervals between samples differ by {jitter:.3g} of their mean: if the sensor '
         uneven += f'samples evenly, set sampling to nominal and nominal_period to {period:.4g}'
-        report.find(WARN, uneven, jitter > JITTER and limits['sampling'] != 'nominal')
+        even = (spread > 0 and not by_clock) or limits['sampling'] == 'nominal'
+        report.find(WARN, uneven, jitter > JITTER and not even)
         report.find(WARN, f'samples arrive {delay:.3g} s after their stamps', delay > DELAY)
         side = 'before' if offset > 0.0 else 'after'
         apart = f'header stamps lie {abs(offset):.3g} s {side} publication'
