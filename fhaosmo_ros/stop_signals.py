@@ -42,6 +42,10 @@ class Stop:
         self.writer.setblocking(False)
         self._set = self._raises = False
 
+    def __del__(self) -> None:
+        self._reader.close()
+        self.writer.close()
+
     def set(self) -> None:
         """End all waiting, from any thread or signal handler."""
         self._set = True

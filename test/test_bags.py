@@ -161,8 +161,8 @@ def test_messages_that_are_listed_and_not_there_are_an_error(storage, tmp_path, 
 
 @pytest.mark.parametrize('preset', ['zstd', 'fastwrite'])
 def test_replay_takes_the_source_stamps(preset, tmp_path, capsys):
-    late = STAMPS + np.random.default_rng(5).integers(0, 600_000, COUNT)
-    late = np.maximum.accumulate(late) + np.arange(COUNT)  # in order, and not in bursts
+    late = STAMPS + np.random.default_rng(5).integers(0, 66_000_000, COUNT)
+    late = np.maximum.accumulate(late) + np.arange(COUNT)  # in the order of publication
     bag = files.write_preset(tmp_path / 'bag', files.floats(late, Y), preset, STAMPS)
     unknown = files.write_preset(tmp_path / 'unknown', files.floats(late, Y), preset, 0 * STAMPS)
     for path, option, stamps, said in (
