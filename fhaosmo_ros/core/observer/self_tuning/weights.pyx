@@ -6,7 +6,7 @@ from libc.math cimport INFINITY, M_PI, NAN, cos, exp, fabs, fmin, isfinite, log,
 from fhaosmo_ros.core.observer.self_tuning.jumps cimport watch
 from fhaosmo_ros.core.observer.self_tuning.members cimport (
     BAND_STEP, COLOURS, COUNT, DECAY, FIRST_SAMPLES, GRID, HALF, HUBER, ORDERS, Members,
-    Shared, Work, entry, factorial, fill, largest, leeway, pair, power
+    Shared, Work, entry, factorial, fill, largest, leeway, power
 )
 from fhaosmo_ros.core.observer.self_tuning.noise cimport (
     FADED, ROUNDED, find_noise, follow_differences
@@ -63,7 +63,7 @@ cdef void find_sizes(Members* m) noexcept nogil:
 
 
 cdef void begin(Members* m, double noise) noexcept nogil:
-    """Let the members begin at the last sample (D 28); all else of `Members` is 0."""
+    """Let the members begin at the last sample (D 28); z behind z_1 follows in `begin_at_rest`."""
     cdef Shared* shared = &m.shared
     cdef double y = m.first_y[FIRST_SAMPLES - 1], period = shared.steady_period
     cdef double omega, kappa, intensity, size, least = INFINITY, sizes = 0.0
@@ -86,8 +86,6 @@ cdef void begin(Members* m, double noise) noexcept nogil:
         intensity = noise * noise * period * power(omega, 2 * (n + 1 + k))
         m.drive[k][g] = intensity
         m.x.z[0][g], m.p.zz[0][g] = y, noise * noise
-        for i in range(1, n):
-            m.p.zz[pair(i, i)][g] = m.sizes[i]
         for i in range(k + 1):
             for j in range(i, k + 1):
                 below = 2 * k - i - j
