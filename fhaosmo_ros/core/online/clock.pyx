@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The time of a sample by a clock that stands still between its ticks, in nanoseconds."""
+"""The time of a sample by a clock that ticks seldom, or by the bursts it came in (ns)."""
 
 from libc.math cimport fabs, isfinite
 
@@ -44,6 +44,7 @@ cdef long long before_burst(
     cdef double kept = 1.0 - 1.0 / REMEMBERED
     cdef double step = fabs(y - bursts.last_y)
     cdef long long length = difference(stamp, bursts.last_stamp), count = clock.tick_count
+    cdef bint on_line
     if not isfinite(step):
         step, y = 0.0, bursts.last_y
     if count == 0 or not 0 <= length <= max_gap:
@@ -54,9 +55,10 @@ cdef long long before_burst(
         bursts.time_of_bursts *= kept
         bursts.time_of_bursts += difference(bursts.last_stamp, bursts.before)
         bursts.samples_of_bursts = kept * bursts.samples_of_bursts + count
+        on_line = count > 1 and clock.ticks > 2 and clock.off_line < 2
         for _ in range(min(count, MOST_VOTES)):
             bursts.share_of_bursts *= kept
-            bursts.share_of_bursts += (1.0 - kept) * (count > 1 and clock.ticks > 2)
+            bursts.share_of_bursts += (1.0 - kept) * on_line
         if count > 1:
             bursts.within_bursts = kept * bursts.within_bursts + bursts.moved / (count - 1)
             bursts.between_bursts = kept * bursts.between_bursts + step
