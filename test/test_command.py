@@ -109,7 +109,8 @@ sys.path.insert(0, sys.argv[1])
 COMMANDS['slow'] = ('slow', '')
 raise SystemExit(main(['slow']))
 """
-LOADS = 'import time\nprint("begun", flush=True)\ntime.sleep(600)\n'
+# Naps: Python handles a signal that comes just before a sleep only after that.
+LOADS = 'import time\nprint("begun", flush=True)\nfor _ in range(6000):\n    time.sleep(0.1)\n'
 WORKS = """
 import argparse, time, warnings
 from pathlib import Path
@@ -122,7 +123,8 @@ def body(arguments, stop):
         for _ in range(2):
             warnings.warn('odd')
         print('begun', flush=True)
-        time.sleep(600)
+        for _ in range(6000):
+            time.sleep(0.1)
 
 def main(argv):
     return run_command(argparse.ArgumentParser(prog='slow'), argv, body)
