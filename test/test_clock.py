@@ -109,18 +109,28 @@ def test_samples_of_a_clock_that_jumps_back_restart_within_one_tick(together):
     assert 0 < estimator.stamp < 100 * MS
 
 
-def read_in_bursts(period: float):
-    """Return stamps of TRUE's samples by a driver that reads a buffer each so many ms, late."""
-    late = np.abs(np.random.default_rng(3).normal(0.0, 5e4, 10_000)).astype(np.int64)
-    reads = TRUE[0] + (period * MS * np.arange(10_000)).astype(np.int64) + late
+def read_in_bursts(period: float, preempted: float):
+    """
+    Return stamps of TRUE's samples by a driver that reads a buffer each so many ms, late.
+
+    At a share of the reads, and of the samples, it waits for about half a period more.
+    """
+    random, count = np.random.default_rng(3), len(TRUE)
+    late = np.abs(random.normal(0.0, 5e4, count)).astype(np.int64)
+    hangs = (random.random((2, count)) < [[preempted], [preempted / period]]).astype(np.int64)
+    hangs *= random.exponential(0.5 * period * MS, (2, count)).astype(np.int64)
+    reads = TRUE[0] + np.cumsum(hangs[0] + round(period * MS)) - round(period * MS) + late
     burst = np.searchsorted(reads, TRUE)
-    return reads[burst] + 5000 * (np.arange(10_000) - np.searchsorted(burst, burst))
+    stamps = reads[burst] + 5000 * (np.arange(count) - np.searchsorted(burst, burst))
+    return np.maximum.accumulate(stamps + hangs[1]) + np.arange(count)
 
 
-@pytest.mark.parametrize('period', [2, 7.3, 16])
-def test_samples_that_a_driver_reads_in_bursts_lie_on_a_line(period):
+@pytest.mark.parametrize(
+    ('period', 'preempted'), [(2, 0.0), (7.3, 0.0), (16, 0.0), (7.3, 0.3), (16, 0.3)]
+)
+def test_samples_that_a_driver_reads_in_bursts_lie_on_a_line(period, preempted):
     estimator, times = OnlineEstimator(), []
-    for k, stamp in enumerate(read_in_bursts(period).tolist()):
+    for k, stamp in enumerate(read_in_bursts(period, preempted).tolist()):
         estimator.update(stamp, sample(k))
         times.append(estimator.stamp)
     assert np.diff(times)[3000:] == pytest.approx(MS, rel=0.002)

@@ -28,7 +28,7 @@ RANGES: dict[str, tuple[float, float]] = {
     **dict.fromkeys(('mean_interval', 'longest_mean'), COUNTS),
     'intervals': (0, 32), 'ticks': (0, 1024), 'repeated': (0.0, 1.0),
     'event': (0, 5), 'event_deviation': (0.0, math.inf), 'past_place': (0, 511),
-    'past_count': (0, 512),
+    'past_count': (0, 512), 'corners': (0, 16),
 }  # fmt: skip
 """Of what is remembered; other integers have 64 bits, other numbers are at most `LARGEST`."""
 

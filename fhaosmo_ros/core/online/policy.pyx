@@ -18,7 +18,8 @@ from fhaosmo_ros.core.observer.status cimport (
 )
 from fhaosmo_ros.core.observer.structure cimport Estimate, Memory, MOST_INPUTS, Record, Structure
 from fhaosmo_ros.core.online.clock cimport (
-    FAR, Bursts, Clock, before_burst, clock_time, comes_in_bursts, difference
+    FAR, MOST_CORNERS, Bursts, Clock, Corner, begin_of_burst, clock_time, comes_in_bursts,
+    difference
 )
 
 from collections import namedtuple
@@ -162,10 +163,10 @@ cdef class Policy:
     cdef Bursts bursts
     cdef Sensor sensor
     # The known inputs of late: for the next sample; at the latest one that was used; a ring of
-    # pieces of time with the same inputs, each its duration (ns) and these.
+    # pieces of time with the same inputs, each its duration (ns) and these; `Corner`s.
     cdef readonly dict arrays  # by their names in a snapshot
     cdef double[::1] held, present
-    cdef double[:, ::1] pieces
+    cdef double[:, ::1] pieces, below
     cdef unsigned long owner  # thread that has it for itself; 0: none
     cdef double acting[MOST_INPUTS]  # in the latest step; a mean where y is known later
 
@@ -175,8 +176,9 @@ cdef class Policy:
         self.arrays = {
             'u': np.zeros(count), 'past_latest': np.zeros(count),
             'past_pieces': np.zeros((pieces, 1 + count)),
+            'below_stamps': np.zeros((MOST_CORNERS, 2)),
         }
-        self.held, self.present, self.pieces = self.arrays.values()
+        self.held, self.present, self.pieces, self.below = self.arrays.values()
 
     def adopt(self, Structure structure not None, parameters):
         """Go on with an observer and parameters of the same sizes."""
@@ -332,11 +334,13 @@ cdef class Policy:
         """
         cdef Clock* clock = &self.clock
         cdef Bursts* bursts = &self.bursts
+        cdef Corner* corner
         cdef long long longest = self.max_gap(), spread = 0, reading, latest, placed
         cdef bint before = bursts.in_bursts
         if self.settings.by_clock:
             return clock_time(clock, stamp, FAR, longest, &self.counters.spread_stamps)
-        reading = before_burst(bursts, clock, stamp, y, longest)
+        corner = <Corner*>&self.below[0, 0]  # of the line below stamps
+        reading = begin_of_burst(bursts, clock, corner, stamp, y, longest)
         latest = stamp + <long long>fmin(clock.spacing, FAR)
         placed = clock_time(clock, reading, latest, longest, &spread)
         bursts.in_bursts = comes_in_bursts(bursts)

@@ -18,7 +18,7 @@ from fhaosmo_ros.core.parameters.errors import ConfigurationError
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-VERSION = 12
+VERSION = 13
 """Of the names."""
 HALF = 2**32
 INTEGER = 'integer'

@@ -111,7 +111,7 @@ cdef class SelfTuning(Structure):
     cdef void begin_afresh(self) noexcept nogil:
         """Let the members begin afresh, by the next samples."""
         memset(self.members, 0, sizeof(Members))
-        self.members.n, self.memory.beyond = self.order, 0.0
+        self.members.n, self.memory.beyond, self.memory.behind = self.order, 0.0, 0.0
 
     cdef bint is_noisy(self, double y) noexcept nogil:
         """Return True if all differences of y show noise, so that it does not repeat itself."""
