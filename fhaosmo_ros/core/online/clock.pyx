@@ -107,7 +107,7 @@ cdef long long begin_of_burst(
         passed = difference(bursts.last_stamp, bursts.ended)
         bursts.time_of_bursts = kept * bursts.time_of_bursts + passed
         bursts.samples_of_bursts = kept * bursts.samples_of_bursts + count
-        on_line = count > 1 and clock.ticks > 2 and clock.off_line < 2
+        on_line = clock.ticks > 2 and clock.off_line < 2 and (count > 1 or bursts.in_bursts)
         for _ in range(min(count, MOST_VOTES)):
             bursts.share_of_bursts *= kept
             bursts.share_of_bursts += (1.0 - kept) * on_line
