@@ -50,11 +50,12 @@ def run(*arguments, command=COMMAND, **options):
     )  # fmt: skip
 
 
-def wait_until(condition, what, seconds=60.0, process=None):
-    """Wait until `condition` holds, at most so many seconds and while the `process` runs."""
+def wait_until(condition, what, seconds=60.0, process=None, pause=0.01):
+    """Return what `condition` gives once that is true, soon enough and while `process` runs."""
     deadline = time.monotonic() + seconds
-    while not condition():
+    while not (found := condition()):
         if time.monotonic() > deadline:
             raise TimeoutError(f'no {what} within {seconds:g} s')
         assert process is None or process.poll() is None, process.communicate()
-        time.sleep(0.01)
+        time.sleep(pause)
+    return found

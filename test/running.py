@@ -6,10 +6,9 @@ from collections.abc import Iterable
 from pathlib import Path
 import signal
 import threading
-import time
 
 from builtin_interfaces.msg import Time
-from commands import ROOT
+from commands import ROOT, wait_until
 from diagnostic_msgs.msg import DiagnosticArray
 from fhaosmo_ros.nodes.middleware.endpoints import subscribe_with_info
 from fhaosmo_ros.nodes.recording import PrivateNode
@@ -129,28 +128,23 @@ class User(PrivateNode):
 
     def __init__(self, name: str = 'user') -> None:
         super().__init__(name)
-        self._changed = threading.Condition()
         self._of_services: dict[str, object] = {}
         self.reports: dict[str, list[Report]] = defaultdict(list)
-        self._listen('/diagnostics', DiagnosticArray, self._on_report)
+        self.node.create_subscription(DiagnosticArray, '/diagnostics', self._on_report, QOS)
 
-    def _on_report(self, _: int, message: DiagnosticArray) -> None:
+    def _on_report(self, message: DiagnosticArray) -> None:
         node = message.status[0].name.partition(': ')[0]
         statuses = {status.name.partition(': ')[2]: status for status in message.status}
         self.reports[node].append(Report(nanoseconds(message.header.stamp), statuses))
 
-    def _listen(self, topic: str, kind: type, callback, qos: QoSProfile = QOS) -> None:
-        def receive(message: object, info: dict) -> None:
-            with self._changed:
-                callback(info['source_timestamp'], message)
-                self._changed.notify_all()
-
-        subscribe_with_info(self.node, kind, topic, receive, qos)
-
     def record(self, topic: str, kind: type, qos: QoSProfile = QOS) -> list[Published]:
         """Return a list that grows with the messages of a topic."""
         messages: list[Published] = []
-        self._listen(topic, kind, lambda *m: messages.append(Published(*m)), qos)
+
+        def receive(message: object, info: dict) -> None:
+            messages.append(Published(info['source_timestamp'], message))
+
+        subscribe_with_info(self.node, kind, topic, receive, qos)
         return messages
 
     def publisher(self, topic: str, kind: type = Float64, heard: int = 1, qos: QoSProfile = QOS):
@@ -159,16 +153,9 @@ class User(PrivateNode):
         self.wait(lambda: publisher.get_subscription_count() >= heard, f'subscription of {topic}')
         return publisher
 
-    def wait(self, condition, what: str, timeout: float = DEADLINE):
-        """Return what `condition` gives once that is true; looked at on every message, and now."""
-        end = time.monotonic() + timeout
-        # Without the lock: a condition that calls a service needs the thread that receives.
-        while not (found := condition()):
-            if time.monotonic() > end:
-                raise TimeoutError(f'no {what} within {timeout} s')
-            with self._changed:
-                self._changed.wait(0.05)
-        return found
+    def wait(self, condition, what: str):
+        """Return what `condition` gives once that is true."""
+        return wait_until(condition, what, DEADLINE, pause=0.002)
 
     def client(self, service: str, kind: type):
         """Return the client of a service that is there."""
