@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """sampling: clock: times of samples by a clock that stands still between its ticks."""
 
-import math
 
 from fhaosmo_ros.core import OnlineEstimator
 import numpy as np
@@ -11,8 +10,8 @@ MS = 1_000_000
 START = 100 * 10**9
 
 
-def sample(k: float) -> float:
-    return 0.2 + 0.1 * math.sin(0.01 * k)
+def sample(k):
+    return 0.2 + 0.1 * np.sin(0.01 * k)
 
 
 def times_by(readings):
@@ -130,9 +129,11 @@ def read_in_bursts(period: float, preempted: float):
 )
 def test_samples_that_a_driver_reads_in_bursts_lie_on_a_line(period, preempted):
     estimator, times = OnlineEstimator(), []
-    for k, stamp in enumerate(read_in_bursts(period, preempted).tolist()):
-        estimator.update(stamp, sample(k))
+    stamps, y = read_in_bursts(period, preempted), sample(np.arange(len(TRUE)))
+    for stamp, value in zip(stamps.tolist(), y.tolist(), strict=True):
+        estimator.update(stamp, value)
         times.append(estimator.stamp)
+    assert (OnlineEstimator().run(stamps, y).t == times).all()
     assert np.diff(times)[3000:] == pytest.approx(MS, rel=0.002)
     assert times[3000:] == pytest.approx(TRUE[3000:], abs=MS)
     assert estimator.counters.spread_stamps > 0.9 * (1.0 - 1.0 / period) * len(TRUE)

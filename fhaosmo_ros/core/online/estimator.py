@@ -298,7 +298,7 @@ class OnlineEstimator:
         -------
         Trajectory
             A row for every sample, whose status says whether it was rejected. ``t`` holds the
-            times of the estimates: the stamps, less `measurement_delay` unless `predict_to_now`.
+            times of the estimates, as `stamp`.
             With `smoothing_lag`, or after `smooth`, a row for each used sample whose estimate has
             become final.
 
@@ -320,8 +320,8 @@ class OnlineEstimator:
     def _run(self, stamps: NDArray[Any], y: NDArray[Any], u: NDArray[Any]) -> Trajectory:
         """Take samples with their known inputs, and look at them for events and for smoothing."""
         with self.policy:
-            record, present, times, acting = self.policy.run(stamps, y, u)
-            found = Trajectory(stamps - self.policy.behind, **record.columns)
+            record, placed, present, times, acting = self.policy.run(stamps, y, u)
+            found = Trajectory(placed - self.policy.behind, **record.columns)
             if self.events.on:
                 deviations = found.standard_deviation[:, -1] if self.observer.self_tuning else None
                 self.events.take(found.t, found.unknown_input, deviations, times, found.status)

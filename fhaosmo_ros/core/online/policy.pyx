@@ -598,15 +598,18 @@ cdef class Policy:
 
     def run(self, const long long[::1] stamps, const double[::1] y, const double[:, ::1] u):
         """
-        Take K samples, their known inputs where finite; return their record and three arrays.
+        Take K samples, their known inputs where finite; return their record and four arrays.
 
-        These have a row for each: z and d where they are carried to the present (else none), times
-        of the observer, and the inputs that acted in the latest step until then.
+        These have a row for each: its time, by what places samples in time; z and d where they are
+        carried to the present (else none); times of the observer, and the inputs that acted in the
+        latest step until then.
         """
         cdef Structure structure = self.structure
         cdef Py_ssize_t k, j, count = y.shape[0], m = structure.inputs
         cdef long long behind
+        cdef int word
         cdef Record record = Record(structure, count)
+        cdef long long[::1] placed = np.array(stamps)
         cdef double[:, ::1] present = np.empty((count * self.settings.to_now, structure.order + 1))
         cdef long long[::1] times = np.empty(count, dtype=np.int64)
         cdef double[:, ::1] acting = np.empty((count, m))
@@ -622,7 +625,10 @@ cdef class Policy:
                             self.held[j] = u[k, j]
                         else:
                             self.counters.rejected_inputs += 1
-                    record.write(structure, k, self.take(stamps[k], y[k]))
+                    word = self.take(stamps[k], y[k])
+                    record.write(structure, k, word)
+                    if not word & UNUSED:
+                        placed[k] = self.course.stamp
                     if self.settings.to_now:
                         self.carry(&present[k, 0])
                     behind = <long long>(structure.memory.behind / NANOSECONDS)
@@ -630,7 +636,9 @@ cdef class Policy:
                     memcpy(&acting[k, 0], self.acting, m * sizeof(double))
         finally:
             structure.busy = False
-        return record, np.asarray(present), np.asarray(times), np.asarray(acting)
+        return (
+            record, np.asarray(placed), np.asarray(present), np.asarray(times), np.asarray(acting)
+        )
 
     @property
     def behind(self):
