@@ -10,7 +10,7 @@ scheme (D 2 to D 7 in docs/mathematics.md).
 from libc.math cimport fmax, fmin
 from libc.string cimport memcpy, memset
 
-from fhaosmo_ros.core.model.prediction cimport Dynamics, MOST_LEVELS, Method, take_step
+from fhaosmo_ros.core.model.prediction cimport MOST_LEVELS
 from fhaosmo_ros.core.observer.sliding_mode cimport SlidingMode
 from fhaosmo_ros.core.observer.structure cimport Level, MOST_INPUTS
 from fhaosmo_ros.core.simulation.system cimport System
@@ -27,9 +27,9 @@ import numpy as np
 
 
 # Bogacki and Shampine 1989, doi:10.1016/0893-9659(89)90079-7.
-cdef Method BOGACKI_SHAMPINE = Method(
-    3, [0.0, 0.5, 0.75, 0.0], [2.0 / 9.0, 1.0 / 3.0, 4.0 / 9.0, 0.0]
-)
+# Of the three stages of a step: when each is evaluated, and the weight of its slope.
+cdef double[3] NODE = [0.0, 0.5, 0.75]
+cdef double[3] WEIGHT = [2.0 / 9.0, 1.0 / 3.0, 4.0 / 9.0]
 
 
 class JointRun(NamedTuple):
@@ -49,13 +49,14 @@ cdef struct State:
     Level level[MOST_LEVELS]  # of the observer
 
 
-cdef class Joint(Dynamics):
+cdef class Joint:
     """A plant, and an observer of the explicit scheme, from their initial states; u = 0."""
 
     cdef System plant
     cdef SlidingMode observer
     cdef double u[MOST_INPUTS]  # known inputs: 0
     cdef State state
+    cdef int size  # doubles of a state that are in use
 
     def __init__(self, System plant not None, configuration):
         cdef SlidingMode observer = make_structure(configuration)
@@ -94,6 +95,20 @@ cdef class Joint(Dynamics):
         if self.observer.adaptive:
             rate.gamma = self.gamma_rate(self.observer, now.gamma)
 
+    cdef void step(self, double t, double h) noexcept nogil:
+        """Go on by `h`; a stage starts from the slope of the one before alone."""
+        cdef State start = self.state, point = self.state, slope
+        cdef double* total = <double*>&self.state
+        cdef int stage, i
+        for stage in range(3):
+            self.rates(t + NODE[stage] * h, <double*>&point, <double*>&slope)
+            for i in range(self.size):
+                total[i] += h * WEIGHT[stage] * (<double*>&slope)[i]
+                if stage < 2:
+                    (<double*>&point)[i] = (
+                        (<double*>&start)[i] + h * NODE[stage + 1] * (<double*>&slope)[i]
+                    )
+
     cdef double gamma_rate(self, SlidingMode law, double gamma) noexcept nogil:
         """Return the rate of gamma by the law of D 7 and D 8, for the latest L."""
         cdef bint rests = law.loss <= law.dead_zone * law.dead_zone
@@ -115,7 +130,7 @@ cdef class Joint(Dynamics):
         with nogil:
             for row in range(count):
                 for _ in range(every if row > 0 else 0):
-                    take_step(self, &BOGACKI_SHAMPINE, step * h, h, <double*>&self.state)
+                    self.step(step * h, h)
                     if law.adaptive:  # D 8
                         self.state.gamma = fmin(fmax(self.state.gamma, law.gamma_min), 1.0)
                     step += 1

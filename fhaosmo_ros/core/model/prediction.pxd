@@ -5,18 +5,7 @@ from fhaosmo_ros.core.model.phi cimport Expressions
 
 cdef enum:
     MOST_LEVELS = 17  # order <= 12, d and at most 3 derivatives of it, and coloured noise
-    MOST_STAGES = 4
-    MOST_STATES = 96  # of a system: plant and observer together have at most 12 + 4 * 16 + 1
-
-
-cdef struct Method:
-    # An explicit Runge-Kutta method; a stage starts from the slope of the one before alone.
-    int stages
-    double node[MOST_STAGES]  # when a stage is evaluated, as a part of the step
-    double weight[MOST_STAGES]  # of its slope
-
-
-cdef Method CLASSICAL  # order 4
+    MOST_STATES = 2 * MOST_LEVELS  # of a system: a prediction has derivatives, too
 
 
 cdef class Dynamics:
@@ -25,9 +14,7 @@ cdef class Dynamics:
     cdef void rates(self, double t, const double* x, double* slope) noexcept nogil
 
 
-cdef void take_step(
-    Dynamics system, const Method* method, double t, double h, double* x
-) noexcept nogil
+cdef void take_step(Dynamics system, double t, double h, double* x) noexcept nogil
 
 
 cdef class Prediction(Dynamics):

@@ -2,44 +2,40 @@
 """
 The one Runge-Kutta integrator, and a triangular model alone between two samples (D 1, D 17).
 
-Prediction, plant, and the simulation of plant and observer together are a `Dynamics` each.
+Prediction and plant are a `Dynamics` each.
 """
 
 from libc.math cimport ceil
 
 from fhaosmo_ros.core.model.phi cimport Dual, Expressions, evaluate
 
-CLASSICAL = Method(4, [0.0, 0.5, 0.5, 1.0], [1.0 / 6.0, 1.0 / 3.0, 1.0 / 3.0, 1.0 / 6.0])
+# Of the four stages of a step: when each is evaluated, and the weight of its slope.
+cdef double[4] NODE = [0.0, 0.5, 0.5, 1.0]
+cdef double[4] WEIGHT = [1.0 / 6.0, 1.0 / 3.0, 1.0 / 3.0, 1.0 / 6.0]
 cdef int MOST_STEPS = 4000  # of one prediction: bounds what a sample may cost
 
 
 cdef class Dynamics:
-    """A system x' = f(t, x) of at most 96 states; others implement `rates`."""
+    """A system x' = f(t, x) of at most 34 states; others implement `rates`."""
 
     cdef void rates(self, double t, const double* x, double* slope) noexcept nogil:
         """Write f(t, x) to `slope`."""
 
 
-cdef void take_step(
-    Dynamics system, const Method* method, double t, double h, double* x
-) noexcept nogil:
-    """Go from x(t) to x(t + h), in place."""
+cdef void take_step(Dynamics system, double t, double h, double* x) noexcept nogil:
+    """Go from x(t) to x(t + h) by the classical method of order 4, in place."""
     cdef double point[MOST_STATES]
     cdef double slope[MOST_STATES]
     cdef double total[MOST_STATES]
     cdef int stage, i, size = system.size
-    cdef double share, reach
     for i in range(size):
         point[i] = total[i] = x[i]
-    for stage in range(method.stages):
-        system.rates(t + method.node[stage] * h, point, slope)
-        share = h * method.weight[stage]
+    for stage in range(4):
+        system.rates(t + NODE[stage] * h, point, slope)
         for i in range(size):
-            total[i] += share * slope[i]
-        if stage + 1 < method.stages:
-            reach = h * method.node[stage + 1]
-            for i in range(size):
-                point[i] = x[i] + reach * slope[i]
+            total[i] += h * WEIGHT[stage] * slope[i]
+            if stage < 3:
+                point[i] = x[i] + h * NODE[stage + 1] * slope[i]
     for i in range(size):
         x[i] = total[i]
 
@@ -74,7 +70,7 @@ cdef class Prediction(Dynamics):
     cdef void step(self, double h, const double* u) noexcept nogil:
         """Go on by `h` in one step of the classical Runge-Kutta method."""
         self.u = u
-        take_step(self, &CLASSICAL, 0.0, h, self.x)
+        take_step(self, 0.0, h, self.x)
 
     cdef void over(self, double h, const double* u) noexcept nogil:
         """Go on by `h` in equal steps of at most `longest`."""

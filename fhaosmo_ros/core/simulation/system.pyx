@@ -5,7 +5,7 @@ from libc.math cimport ceil, fmax, fmin, sin
 from libc.string cimport memcpy
 
 from fhaosmo_ros.core.model.phi cimport Expressions, evaluate
-from fhaosmo_ros.core.model.prediction cimport CLASSICAL, MOST_LEVELS, take_step
+from fhaosmo_ros.core.model.prediction cimport MOST_LEVELS, take_step
 
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 import numpy as np
@@ -114,7 +114,7 @@ cdef class System(Dynamics):
         step = (t - begin) / count
         self.u, self.t = &self.held[0], t
         for j in range(count):
-            take_step(self, &CLASSICAL, begin + j * step, step, self.z)
+            take_step(self, begin + j * step, step, self.z)
 
     def advance(self, t, u):
         """
