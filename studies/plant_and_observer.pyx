@@ -10,17 +10,15 @@ scheme (D 2 to D 7 in docs/mathematics.md).
 from libc.math cimport fmax, fmin
 from libc.string cimport memcpy, memset
 
-from fhaosmo_ros.core.model.prediction cimport MOST_LEVELS
+from fhaosmo_ros.core.model.prediction cimport Dynamics, MOST_LEVELS
 from fhaosmo_ros.core.observer.sliding_mode cimport SlidingMode
 from fhaosmo_ros.core.observer.structure cimport Level, MOST_INPUTS
-from fhaosmo_ros.core.simulation.system cimport System
 
 from typing import NamedTuple
 
 from fhaosmo_ros.core.model.inputs import Floats
 from fhaosmo_ros.core.observer.configuration import ObserverConfiguration
 from fhaosmo_ros.core.observer.observer import make_structure
-from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.tables import OBSERVER_PARAMETERS
 from fhaosmo_ros.core.simulation.plant import Plant
 import numpy as np
@@ -52,23 +50,21 @@ cdef struct State:
 cdef class Joint:
     """A plant, and an observer of the explicit scheme, from their initial states; u = 0."""
 
-    cdef System plant
+    cdef Dynamics plant
     cdef SlidingMode observer
     cdef double u[MOST_INPUTS]  # known inputs: 0
     cdef State state
     cdef int size  # doubles of a state that are in use
 
-    def __init__(self, System plant not None, configuration):
+    def __init__(self, Dynamics plant not None, configuration):
         cdef SlidingMode observer = make_structure(configuration)
+        cdef double[::1] states = plant.states
         cdef int i
         self.plant, self.observer = plant, observer
-        if plant.phi.inputs > MOST_INPUTS:
-            raise ConfigurationError(f'plant: expected at most {MOST_INPUTS} known inputs')
-        plant.u = self.u
         self.size = (sizeof(State) - sizeof(self.state.level)) // sizeof(double)
         self.size += observer.levels * (sizeof(Level) // sizeof(double))
         for i in range(plant.size):
-            self.state.z[i] = plant.z[i]
+            self.state.z[i] = states[i]
         self.state.level = observer.level
         if observer.from_measurement:
             self.state.level[0].z_hat = self.state.z[0]
@@ -151,8 +147,8 @@ def simulate(observer, plant, step=1e-3, duration=20.0, every=1):
     """
     own = {'scheme': 'explicit', 'noise_size': 0.0}  # a solver has no scheme of its own
     configuration = ObserverConfiguration(OBSERVER_PARAMETERS.complete(observer).changed(own))
-    cdef System system = Plant(plant)._system
+    plant = Plant(plant)
     rows = round(duration / step) // every + 1
-    z, z_hat, gamma = Joint(system, configuration).run(step, rows, every)
+    z, z_hat, gamma = Joint(plant._system, configuration).run(step, rows, every)
     t = np.arange(rows, dtype=np.float64) * (every * step)
-    return JointRun(t, z, system.d.along(t), z_hat, gamma)
+    return JointRun(t, z, plant._d.along(t), z_hat, gamma)

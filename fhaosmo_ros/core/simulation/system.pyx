@@ -5,7 +5,7 @@ from libc.math cimport ceil, fmax, fmin, sin
 from libc.string cimport memcpy
 
 from fhaosmo_ros.core.model.phi cimport Expressions, evaluate
-from fhaosmo_ros.core.model.prediction cimport MOST_LEVELS, take_step
+from fhaosmo_ros.core.model.prediction cimport Dynamics, MOST_LEVELS, take_step
 
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 import numpy as np
@@ -16,6 +16,9 @@ cdef double SWEEP_TIME = 20.0
 cdef double[MOST_LEVELS] STILL  # direction of a derivative that nobody needs: 0
 KINDS = ('none', 'sine', 'step', 'square', 'chirp')
 
+cdef enum Kind:
+    NONE, SINE, STEP, SQUARE, CHIRP, TABLE
+
 
 cdef class Disturbance:
     """
@@ -24,6 +27,14 @@ cdef class Disturbance:
     It is the wave that checked parameters of a plant say; or a table: `values`, (M,), M >= 2, at
     0, `spacing`, ... (s), linear in between and constant behind the last one.
     """
+
+    cdef Kind kind
+    cdef double amplitude  # of the wave, or height of the step (unit of d)
+    cdef double omega  # angular frequency; a chirp's at t = 0 (rad/s)
+    cdef double offset  # added to it (unit of d)
+    cdef double start  # time of the step (s)
+    cdef double spacing  # of the values of a table (s)
+    cdef const double[::1] values  # from t = 0 on, at least 2 (unit of d)
 
     def __cinit__(self, p, values=None, double spacing=1.0):
         self.spacing = spacing
@@ -76,6 +87,13 @@ cdef class System(Dynamics):
     `phi` are Phi_1 .. Phi_n, `h` is the longest step (s), and `z`, (n,), are the states at t = 0.
     """
 
+    cdef Expressions phi
+    cdef Disturbance d
+    cdef double h  # longest step (s)
+    cdef const double[::1] held  # known inputs of the latest interval
+    cdef double t  # time that it has come to (s)
+    cdef double z[MOST_LEVELS]  # z_1 .. z_n then
+
     def __cinit__(self, Expressions phi not None, Disturbance d not None, double h, z):
         cdef int i
         self.size, self.h = phi.count, h
@@ -102,7 +120,7 @@ cdef class System(Dynamics):
         cdef int i, last = self.size - 1
         for i in range(self.size):
             slope[i] = x[i + 1] if i < last else self.d.at(t)
-            slope[i] += evaluate(self.phi, i, x, STILL, self.u).value
+            slope[i] += evaluate(self.phi, i, x, STILL, &self.held[0]).value
 
     cdef void go_to(self, double t) noexcept nogil:
         """Bring `z` to `t` in equal steps of at most `h`; one that has passed is left out."""
@@ -112,7 +130,7 @@ cdef class System(Dynamics):
             return
         count = <long long>fmax(ceil((t - begin) / self.h - 1e-9), 1.0)
         step = (t - begin) / count
-        self.u, self.t = &self.held[0], t
+        self.t = t
         for j in range(count):
             take_step(self, begin + j * step, step, self.z)
 
