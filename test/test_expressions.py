@@ -79,7 +79,7 @@ def test_anything_else_is_refused_in_one_line(text, recwarn):
 @given(ANY_TEXT | st.text('z1u23+-*/().e sincoexplgqrtab', max_size=40))
 def test_any_text_is_either_an_expression_or_an_error(text):
     try:
-        tape = parse(text, 3)
+        tape, _ = parse(text, 3)
     except ConfigurationError as refusal:
         assert str(refusal).isprintable()  # noqa: PT017
         return

@@ -46,6 +46,8 @@ OPERATORS: dict[type[ast.operator], int] = {
 }  # fmt: skip
 Operation = tuple[int, float]
 """A code of `phi`, and the index or the number that belongs to it."""
+NUMBER, INPUTS, LINEAR, OTHER = range(4)
+"""What an expression is: numbers alone; with known inputs; linear in the states; or not."""
 
 
 class TriangularModel:
@@ -99,10 +101,11 @@ class TriangularModel:
         self.order = len(self.phi)
         _check_names(inputs, constants)
         self.inputs = tuple(inputs)
-        self._parsed = [parse(text, i, inputs, constants) for i, text in enumerate(self.phi, 1)]
+        parsed = [parse(text, i, inputs, constants) for i, text in enumerate(self.phi, 1)]
+        self._parsed = [operations for operations, _ in parsed]
         used = {index for one in self._parsed for code, index in one if code == codes.INPUT}
         self.used_inputs = tuple(name for k, name in enumerate(self.inputs) if k in used)
-        self.is_linear = all(_is_linear(one) for one in self._parsed)
+        self.is_linear = all(kind <= LINEAR for _, kind in parsed)
         self.expressions = codes.Expressions(self._parsed, self.order, len(self.inputs))
 
     @classmethod
@@ -128,7 +131,7 @@ class TriangularModel:
 
         """
         levels = range(self.order + 1, self.order + 2 + derivatives)
-        behind = [parse(f'-{decay!r} * z{i}', i) if decay > 0.0 else [] for i in levels]
+        behind = [parse(f'-{decay!r} * z{i}', i)[0] if decay > 0.0 else [] for i in levels]
         expressions = [*self._parsed, *behind]
         return codes.Expressions(expressions, len(expressions), len(self.inputs))
 
@@ -168,12 +171,13 @@ def _check_names(inputs: Sequence[str], constants: Mapping[str, float]) -> None:
 
 def parse(
     text: str, level: int, inputs: Sequence[str] = ('u',), constants: Mapping[str, float] = {}
-) -> list[Operation]:
+) -> tuple[list[Operation], int]:
     """
     Parse Phi_level, which may use z1 .. z<level>, known inputs and constants by their names.
 
-    Return operations in postfix order, none for an expression that is the constant 0. Raises
-    ConfigurationError for anything that is not on the whitelist, or exceeds the limits above.
+    Return operations in postfix order, none for an expression that is the constant 0, and what it
+    is, `NUMBER` .. `OTHER`. Raises ConfigurationError for anything that is not on the whitelist,
+    or exceeds the limits above.
     """
     parser = _Parser(text, level, inputs, constants)
     if len(text) > MAX_LENGTH:
@@ -190,8 +194,8 @@ def parse(
     work = sum(isinstance(node, ast.Call | ast.BinOp | ast.UnaryOp) for node in ast.walk(body))
     if work > MAX_OPERATIONS:  # at every evaluation
         raise parser.error(f'{work} operations, at most {MAX_OPERATIONS}')
-    parser.emit(body)
-    return [] if parser.code == [(codes.CONST, 0.0)] else parser.code
+    kind = parser.emit(body)
+    return ([] if parser.code == [(codes.CONST, 0.0)] else parser.code), kind
 
 
 class _Parser:
@@ -204,8 +208,8 @@ class _Parser:
         self.names |= {name: (codes.INPUT, k) for k, name in enumerate(inputs)}
         self.names |= {name: (codes.CONST, x) for name, x in (NUMBERS | dict(constants)).items()}
 
-    def emit(self, node: ast.expr) -> None:
-        """Append the operations of a part of the expression."""
+    def emit(self, node: ast.expr) -> int:
+        """Append the operations of a part of the expression, and return what it is."""
         match node:
             case ast.Constant(value=bool()):
                 raise self.error(f'{node.value!r} is not a number')
@@ -213,14 +217,16 @@ class _Parser:
                 if number > sys.float_info.max:
                     raise self.error('a number is too large')
                 self.code.append((codes.CONST, float(number)))
+                return NUMBER
             case ast.Name(id=name):
                 self.code.append(self.name(name))
+                return {codes.CONST: NUMBER, codes.INPUT: INPUTS}.get(self.code[-1][0], LINEAR)
             case ast.UnaryOp(op=ast.UAdd(), operand=operand):
-                self.emit(operand)
+                return self.emit(operand)
             case ast.UnaryOp(op=ast.USub(), operand=operand):
-                self.apply(codes.NEG, [operand])
+                return self.apply(codes.NEG, [operand])
             case ast.BinOp(left=left, op=op, right=right) if type(op) in OPERATORS:
-                self.apply(OPERATORS[type(op)], [left, right])
+                return self.apply(OPERATORS[type(op)], [left, right])
             case ast.BinOp(op=ast.BitXor()):
                 raise self.error("'^' is not allowed, a power is written z1**2")
             case ast.Call(func=ast.Name(id=name), args=arguments, keywords=[]):
@@ -229,17 +235,17 @@ class _Parser:
                 counts, needed = FUNCTIONS[name]
                 if len(arguments) not in counts:
                     raise self.error(f'{name} needs {needed}, got {len(arguments)}')
-                self.apply(getattr(codes, name.upper()), arguments)
+                return self.apply(getattr(codes, name.upper()), arguments)
             case _:
                 part = ast.get_source_segment(self.text.strip(), node) or ''
                 raise self.error(f'{part[:60]!r} is not allowed')
 
-    def apply(self, code: int, operands: list[ast.expr]) -> None:
-        """Append an operation on one or two operands; on more, on its result and the next one."""
-        count = min(len(operands), 2)
-        for k, operand in enumerate(operands, 1):
-            self.emit(operand)
-            if k < count:
+    def apply(self, code: int, operands: list[ast.expr]) -> int:
+        """Append an operation; on more than two operands, on its result and the next one."""
+        count, kinds = min(len(operands), 2), list[int]()
+        for operand in operands:
+            kinds.append(self.emit(operand))
+            if len(kinds) < count:
                 continue
             self.code.append((code, 0.0))
             last = self.code[-1 - count :]
@@ -248,6 +254,10 @@ class _Parser:
                 if not math.isfinite(value):
                     raise self.error('a constant part of it is not a finite number')
                 self.code[-1 - count :] = [(codes.CONST, value)]
+        stays = code in (codes.ADD, codes.SUB, codes.NEG) or (
+            (code == codes.MUL and NUMBER in kinds) or (code == codes.DIV and kinds[1] == NUMBER)
+        )
+        return max(kinds) if stays or max(kinds) < LINEAR else OTHER
 
     def name(self, name: str) -> Operation:
         if name in self.names:
@@ -270,25 +280,3 @@ class _Parser:
             f"parameter 'phi': Phi_{self.level} = {self.text!r}: {reason}; allowed are {names}, "
             f'+ - * / ** and {" ".join(KNOWN)}'
         )
-
-
-def _is_linear(tokens: Sequence[Operation]) -> bool:
-    """Return True if an expression is sums of states times numbers, and of anything else."""
-    # 0: a number, 1: a number or known inputs, 2: linear in the states, 3: anything else
-    stack: list[int] = []
-    for code, _ in tokens:
-        if code <= codes.INPUT:
-            stack.append({codes.CONST: 0, codes.INPUT: 1, codes.STATE: 2}[int(code)])
-        elif code <= codes.MAX:
-            b, a = stack.pop(), stack.pop()
-            most = max(a, b)
-            is_kept = (
-                code in (codes.ADD, codes.SUB)
-                or (code == codes.MUL and 0 in (a, b))
-                or (code == codes.DIV and b == 0)
-            )
-            stack.append(most if is_kept or most < 2 else 3)
-        else:
-            a = stack.pop()
-            stack.append(a if code == codes.NEG or a < 2 else 3)
-    return max(stack, default=0) < 3
