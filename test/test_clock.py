@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """sampling: clock: times of samples by a clock that stands still between its ticks."""
 
-
 from fhaosmo_ros.core import OnlineEstimator
 import numpy as np
 import pytest
