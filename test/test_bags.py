@@ -9,6 +9,7 @@ import sqlite3
 import struct
 
 import bag_files as files
+from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.tools.bags.reader import BagReader
 from fhaosmo_ros.tools.bags.recorded import read_ticks
@@ -175,8 +176,11 @@ def test_replay_takes_the_source_stamps(preset, tmp_path, capsys):
         out = tmp_path / 'out.npz'
         assert replay.main([str(path), '-o', str(out), '--force', '-p', option]) == 0
         assert f'stamps: {said}' in capsys.readouterr().out
+        run = OnlineEstimator(sampling='clock' if 'clock' in option else 'source_stamp')
+        expected = run.run(stamps, Y)
         with np.load(out) as found:
-            np.testing.assert_array_equal(found['stamp_ns'], stamps)
+            np.testing.assert_array_equal(found['stamp_ns'], expected.t)
+            np.testing.assert_array_equal(found['unknown_input'], expected.unknown_input)
 
 
 # What an estimator published together is put together again, whatever the recording lacks

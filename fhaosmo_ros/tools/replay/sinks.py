@@ -25,7 +25,7 @@ class Rows(NamedTuple):
 
     times: NDArray[np.int64]  # (K,) stamps of the samples in the bag, in nanoseconds
     y: NDArray[np.float64]  # (K,)
-    estimates: Trajectory  # `t` holds the stamps that dt came from, in nanoseconds
+    estimates: Trajectory  # `t` in nanoseconds
     active: NDArray[np.int8]  # (K,) 1 while an event lasts; empty where none are asked for
     events: list[tuple[int, Event]]  # those that begin or end, with their stamps in the bag
 
