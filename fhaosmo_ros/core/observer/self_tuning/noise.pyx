@@ -366,18 +366,6 @@ cdef double share_of_multiples(const double* values, double quantum) noexcept no
     return multiples / steps if steps > LATTICE_SHARE * (FIRST_SAMPLES - 1) else 1.0
 
 
-cdef double period_of_bursts(const double* intervals, double mean) noexcept nogil:
-    """Return the period of samples that come in bursts, from the first to the last whole one."""
-    cdef double passed = 0.0, until = 0.0
-    cdef int i, first = 0, last = 0
-    for i in range(1, FIRST_SAMPLES):
-        passed += intervals[i] if first > 0 else 0.0
-        if intervals[i] > mean:
-            first = first if first > 0 else i
-            last, until = i, passed
-    return until / (last - first) if last > first else mean
-
-
 cdef double median(double* values, int count) noexcept nogil:
     """Return the median of `count` values; sorts these in place."""
     cdef double value
@@ -413,8 +401,6 @@ cdef double find_noise(Members* m) noexcept nogil:
     size = median(values[0] + 1, FIRST_SAMPLES - 2) / MEDIAN
     shared.steady_period = period
     shared.usual_interval = median(values[1], FIRST_SAMPLES - 1)
-    if values[1][FIRST_SAMPLES // 4] < 0.5 * period:
-        shared.usual_interval = period_of_bursts(m.first_h, period)
     shared.jitter = fmax(size * size / 6.0, (EXACT * period) * (EXACT * period))
     ages[0][0] = ages[1][0] = 0.0
     for i in range(1, FIRST_SAMPLES):

@@ -2,6 +2,7 @@
 """The members begin; how likely each of them is, and the mean of all (D 28, D 34)."""
 
 from libc.math cimport INFINITY, M_PI, NAN, cos, exp, fabs, fmin, isfinite, log, pow, sqrt
+from libc.string cimport memmove
 
 from fhaosmo_ros.core.observer.self_tuning.jumps cimport watch
 from fhaosmo_ros.core.observer.self_tuning.members cimport (
@@ -22,6 +23,9 @@ cdef double KEPT = exp(-1.0 / 8000.0)  # part of a log-likelihood that is not fo
 # States may be so many times as large: a start that is too sure of them costs more than one that
 # is not sure enough.
 cdef double DOUBT = 10.0
+# Samples for which the members wait at most where the first ones come in bursts: ten of 32 each
+# tell the policy how to place them (core/online/clock.pyx), after which they begin afresh.
+cdef double LONGEST_WAIT = 320.0
 
 
 # The first samples
@@ -31,6 +35,7 @@ cdef void gather(Members* m) noexcept nogil:
     Collect the first samples; once there are enough, let the members begin (D 28).
 
     y may be constant until its sensor is ready: then the last constant one is the first of them.
+    Where they come in bursts, the members wait for later ones.
     """
     cdef Shared* shared = &m.shared
     cdef double y = m.work.sample.y
@@ -41,9 +46,26 @@ cdef void gather(Members* m) noexcept nogil:
         m.first_y[count], m.first_h[count] = y, m.work.sample.h
         count += 1
     shared.samples = count
+    if count == FIRST_SAMPLES and comes_in_bursts(m) and shared.waiting < LONGEST_WAIT:
+        shared.samples = count = FIRST_SAMPLES // 2  # the first half makes room
+        shared.waiting += count
+        memmove(m.first_y, m.first_y + count, count * sizeof(double))
+        memmove(m.first_h, m.first_h + count, count * sizeof(double))
     if count == FIRST_SAMPLES:
+        shared.waiting = 0.0
         begin(m, find_noise(m))
         shared.samples = FIRST_SAMPLES + 1
+
+
+cdef bint comes_in_bursts(Members* m) noexcept nogil:
+    """Return True if more than a quarter of the first intervals are below half of the mean."""
+    cdef double total = 0.0
+    cdef int i, few = 0
+    for i in range(1, FIRST_SAMPLES):
+        total += m.first_h[i]
+    for i in range(1, FIRST_SAMPLES):
+        few += m.first_h[i] * (FIRST_SAMPLES - 1) < 0.5 * total
+    return 4 * few > FIRST_SAMPLES
 
 
 cdef void find_sizes(Members* m) noexcept nogil:
