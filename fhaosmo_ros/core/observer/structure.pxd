@@ -76,6 +76,7 @@ cdef class Structure:
     cdef double passed  # the time that a step takes for passed (s)
     cdef public int word  # status word of the latest sample
     cdef bint busy  # a run without the GIL is under way
+    cdef bint placed  # the policy has placed the sample on a line: its time is no stamp
 
     # For whoever feeds it samples.
     cdef int start(self, double y) noexcept nogil

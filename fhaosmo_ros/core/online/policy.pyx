@@ -221,6 +221,7 @@ cdef class Policy:
             now = course.now
         elif stamp != 0:  # else there is no time yet
             now = self.place(stamp, y)
+            self.structure.placed = self.settings.by_clock or self.bursts.in_bursts
         word = self.judge(stamp, now, y)
         if not word and not isnan(memory.y):
             elapsed = self.since_latest(now, y, &word)

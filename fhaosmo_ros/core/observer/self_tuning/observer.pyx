@@ -276,7 +276,7 @@ cdef class SelfTuning(Structure):
         )
         gate = HUBER if goes_on else GATE
         likely = is_likely(m, gate, late)
-        if even and (not likely or self.may_have_waited(change)):
+        if even and not self.placed and (not likely or self.may_have_waited(change)):
             likely = self.is_likely_when_even(h, u, gate)
         if likely and memory.beyond == 0.0:
             follow_usual_interval(m, self.passed)
