@@ -88,6 +88,8 @@ class TopicRecorder(PrivateNode):
     be recorded, or not as a whole.
     """
 
+    grace = None  # what is being written is written before the bag is closed
+
     def __init__(
         self,
         bag: Any,

@@ -147,3 +147,27 @@ def test_a_signal_ends_it_in_every_state(user, launch, transition):
     assert not transition or manager.change(transition)
     process.send_signal(signal.SIGINT)
     assert process.wait(GRACE) == 0
+
+
+STUCK = """
+import sys, time
+from fhaosmo_ros.__main__ import main
+from rclpy.node import Node
+
+def stuck(self, period, callback, *args, create=Node.create_timer, **options):
+    def sleep():
+        print('asleep', flush=True)
+        time.sleep(3600.0)
+    return create(self, period, sleep, *args, **options)
+
+Node.create_timer = stuck
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+def test_a_callback_that_does_not_end_does_not_hold_the_node(user, launch):
+    process = launch(STUCK)
+    user.wait(lambda: 'asleep' in process.output(), 'callback')
+    process.send_signal(signal.SIGINT)
+    assert process.wait(GRACE) == 0
+    assert 'ended while a callback was running' in process.output()

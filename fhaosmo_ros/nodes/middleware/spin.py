@@ -4,6 +4,7 @@
 from collections.abc import Callable
 import faulthandler
 import gc
+import os
 import re
 import sys
 import threading
@@ -27,7 +28,7 @@ except ImportError:  # an older rclpy
     EventsExecutor = None
 
 PATIENCE = 20.0
-"""Seconds after a signal in which all callbacks have to end, or the process ends without them."""
+"""Seconds after a signal in which the middleware has to end, or the process ends without it."""
 FOREVER = 3600.0
 """
 Seconds. Without a finite timeout, the events executor of the PyPI wheels (rclpy 7.1) never runs a
@@ -43,8 +44,11 @@ class Spinner:
     with the events executor of rclpy 7.1. So that spins here until a future is done, at which
     `wake` makes it look, and the main thread waits for signals: Python runs handlers there only.
 
-    `on_end` is called in that thread when it ends, also by the `error` that a callback raised.
+    `on_end` is called in that thread when it ends, also by the `error` that a callback raised. At
+    the end a callback has `grace` seconds to end, or the node stays; None: as long as it takes.
     """
+
+    grace: float | None = 0.5
 
     def __init__(self, node: Node, on_end: Callable[[], None] = lambda: None) -> None:
         self.error: BaseException | None = None
@@ -67,10 +71,12 @@ class Spinner:
     def __exit__(self, *_: object) -> None:
         self._stop.set_result(None)
         self._executor.wake()
-        self._thread.join()
-        self._executor.shutdown()
-        self.node.destroy_node()
-        rclpy.try_shutdown(context=self.node.context)
+        self._thread.join(timeout=self.grace)
+        self.stuck = self._thread.is_alive()  # a callback is still running
+        if not self.stuck:
+            self._executor.shutdown()
+            self.node.destroy_node()
+            rclpy.try_shutdown(context=self.node.context)
 
     def _spin(self) -> None:
         try:
@@ -116,6 +122,9 @@ def run_node(name: str, factory: Callable[..., Node], argv: list[str] | None) ->
             ended.wait()
             # Says where each thread was: an end that takes so long is an error to look into.
             faulthandler.dump_traceback_later(PATIENCE, exit=True)
+        if spinner.stuck:  # a node has nothing to save
+            print(f'{name}: ended while a callback was running', file=sys.stderr, flush=True)
+            os._exit(0)
         if spinner.error is not None:
             print(f'{name}: error: a callback failed', file=sys.stderr)
             traceback.print_exception(spinner.error)
