@@ -298,9 +298,8 @@ class OnlineEstimator:
         -------
         Trajectory
             A row for every sample, whose status says whether it was rejected. ``t`` holds the
-            times of the estimates, as `stamp`.
-            With `smoothing_lag`, or after `smooth`, a row for each used sample whose estimate has
-            become final.
+            times of the estimates, as `stamp`. With `smoothing_lag`, or after `smooth`, a row for
+            each used sample whose estimate has become final.
 
         Raises
         ------

@@ -46,7 +46,7 @@ cdef void gather(Members* m) noexcept nogil:
         m.first_y[count], m.first_h[count] = y, m.work.sample.h
         count += 1
     shared.samples = count
-    if count == FIRST_SAMPLES and comes_in_bursts(m) and shared.waiting < LONGEST_WAIT:
+    if count == FIRST_SAMPLES and begins_in_bursts(m) and shared.waiting < LONGEST_WAIT:
         shared.samples = count = FIRST_SAMPLES // 2  # the first half makes room
         shared.waiting += count
         memmove(m.first_y, m.first_y + count, count * sizeof(double))
@@ -57,15 +57,15 @@ cdef void gather(Members* m) noexcept nogil:
         shared.samples = FIRST_SAMPLES + 1
 
 
-cdef bint comes_in_bursts(Members* m) noexcept nogil:
+cdef bint begins_in_bursts(Members* m) noexcept nogil:
     """Return True if more than a quarter of the first intervals are below half of the mean."""
     cdef double total = 0.0
-    cdef int i, few = 0
+    cdef int i, close = 0
     for i in range(1, FIRST_SAMPLES):
         total += m.first_h[i]
     for i in range(1, FIRST_SAMPLES):
-        few += m.first_h[i] * (FIRST_SAMPLES - 1) < 0.5 * total
-    return 4 * few > FIRST_SAMPLES
+        close += m.first_h[i] * (FIRST_SAMPLES - 1) < 0.5 * total
+    return 4 * close > FIRST_SAMPLES
 
 
 cdef void find_sizes(Members* m) noexcept nogil:
